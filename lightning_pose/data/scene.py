@@ -1,0 +1,69 @@
+"""The Scene: posed frames and their splits, the one form in which every dataset enters the project."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+__all__ = ["SPLITS", "Frame", "Intrinsics", "Scene"]
+
+SPLITS = ("train", "val", "test")
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """Pinhole camera matrix entries, in pixels."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One posed image.
+
+    Attributes:
+        image: path of the image file.
+        position_m: (3,) float64, the camera centre in the world, metres (or the scene's unit).
+        quat_wxyz: (4,) float64, unit Hamilton quaternion, camera-to-world, OpenCV axes.
+        sequence: name of the trajectory the frame belongs to.
+        index: position of the frame in its sequence, as the dataset numbers it.
+        timestamp: seconds, where the dataset knows them.
+        intrinsics: the camera, where the format knows it.
+    """
+
+    image: Path
+    position_m: np.ndarray
+    quat_wxyz: np.ndarray
+    sequence: str
+    index: int
+    timestamp: float | None = None
+    intrinsics: Intrinsics | None = None
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Every frame of one place, and which of them train, validate and test.
+
+    Attributes:
+        name: short name of the scene, the folder's name.
+        root: the folder it was read from.
+        format: name of the adapter that read it.
+        frames: every frame; those of one sequence are consecutive and in order.
+        splits: frame indices of each of `SPLITS`; disjoint.
+        unit: unit of the positions: `m`, or `scene` where the scale is arbitrary.
+        ground_truth: where the poses come from (`original`, `sfm`, `synthetic`, ...).
+    """
+
+    name: str
+    root: Path
+    format: str
+    frames: tuple[Frame, ...]
+    splits: Mapping[str, np.ndarray] = field(default_factory=dict)
+    unit: str = "m"
+    ground_truth: str = "original"

@@ -1,0 +1,128 @@
+"""The extractor contract: images in, named arrays out, with settings that key the cache."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from lightning_pose.errors import ConfigError
+
+__all__ = ["MIN_STORED_FEATURES", "FeatureExtractor", "LocalExtractor", "Record"]
+
+Record = dict[str, np.ndarray]
+"""What an extractor says of one image: arrays by name."""
+
+MIN_STORED_FEATURES = 300
+"""The cache keeps at least this many local features, so that a smaller N never extracts again."""
+
+
+class FeatureExtractor(ABC):
+    """Turns images into arrays; everything downstream (cache, data modules, models) sees only this.
+
+    To add an extractor, subclass it and give
+
+    - `color`: whether `extract` wants `gray` (H, W) or `rgb` (H, W, 3) uint8 images;
+    - `primary`: the name of the array that the networks read;
+    - `settings`: everything that changes the stored arrays, in plain types (it keys the cache);
+    - `feature_shape`: the shape that `features` returns for one image;
+    - `extract`: the work itself, deterministic, for images that may differ in size;
+    - `features`: only where the networks do not read the stored primary array as it is.
+
+    Constructor arguments must be plain types, so that a config file can name the extractor.
+    """
+
+    color: ClassVar[Literal["gray", "rgb"]]
+    primary: ClassVar[str]
+
+    @property
+    def name(self) -> str:
+        """Short lower-case name, used in cache folders, run names and tables."""
+        return type(self).__name__.lower()
+
+    @property
+    @abstractmethod
+    def settings(self) -> Mapping[str, str | int | float | bool | None]:
+        """Whatever changes the stored arrays."""
+
+    @property
+    @abstractmethod
+    def feature_shape(self) -> tuple[int, ...]:
+        """Shape of one image's features as the networks read them."""
+
+    @abstractmethod
+    def extract(self, images: Sequence[np.ndarray]) -> list[Record]:
+        """Compute one record per image."""
+
+    def features(self, record: Record) -> np.ndarray:
+        """What the networks read, out of one stored record: float32 of `feature_shape`."""
+        return record[self.primary]
+
+
+class LocalExtractor(FeatureExtractor):
+    """Keypoints with descriptors, strongest first; each record holds
+
+    - `descriptors`: (M, D) float32, L2-normalised, sorted by response, zero rows at the end;
+    - `keypoints`: (M, 5) float32: x, y, size (pixels), response, angle (degrees), zero rows at the end;
+    - `count`: () int64, how many of the M rows are real;
+    - `image_size`: (2,) int64, width and height of the image,
+
+    with M = max(n_features, MIN_STORED_FEATURES): the N strongest are a prefix of the M strongest, so
+    the cache is shared by every N up to M. `features` cuts the prefix of N rows.
+
+    Args:
+        n_features: N, how many of the strongest features the networks read.
+        with_geometry: append normalised x, y, log size and response to each descriptor (D + 4 columns).
+
+    Raises:
+        ConfigError: n_features is not positive.
+    """
+
+    color: ClassVar[Literal["gray", "rgb"]] = "gray"
+    primary: ClassVar[str] = "descriptors"
+    descriptor_dim: ClassVar[int]
+
+    def __init__(self, n_features: int = 300, with_geometry: bool = False) -> None:
+        if n_features < 1:
+            raise ConfigError(f"n_features is {n_features}; give the number of features to keep, 1 or more")
+        self.n_features = n_features
+        self.with_geometry = with_geometry
+
+    @property
+    def n_stored(self) -> int:
+        """M, the rows kept in the cache."""
+        return max(self.n_features, MIN_STORED_FEATURES)
+
+    @property
+    def feature_shape(self) -> tuple[int, ...]:
+        return self.n_features, self.descriptor_dim + (4 if self.with_geometry else 0)
+
+    def features(self, record: Record) -> np.ndarray:
+        """(N, D) descriptors, or (N, D + 4) with x, y in -1..1, log size and response, both scaled.
+
+        Rows past `count` stay zero in every column.
+        """
+        rows = record["descriptors"][: self.n_features]
+        if not self.with_geometry:
+            return rows
+        return np.concatenate([rows, _geometry(record)[: self.n_features]], axis=1, dtype=np.float32)
+
+
+def _geometry(record: Record) -> np.ndarray:
+    """(M, 4) float32: x, y in -1..1 (y by half the height), log size, and log response below the strongest."""
+    x, y, size, response = record["keypoints"][:, :4].T
+    real = np.arange(len(x)) < record["count"]
+    half_w, half_h = np.maximum(record["image_size"] / 2, 0.5)
+    strongest = max(float(response[:1].sum()), np.finfo(np.float32).tiny)
+    columns = np.stack(
+        [
+            x / half_w - 1,
+            y / half_h - 1,
+            np.log2(np.maximum(size, 1.0) / 16),
+            np.log10(np.maximum(response / strongest, 1e-6)) / 2,
+        ],
+        axis=1,
+    )
+    return (columns * real[:, None]).astype(np.float32)
