@@ -1,0 +1,145 @@
+"""The pose loss in all forms of the thesis, and with learned weights."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor, nn
+
+from lightning_pose.errors import ConfigError
+from lightning_pose.geometry import quat_normalize
+
+__all__ = ["LossConfig", "PoseLoss"]
+
+Form = Literal["joint", "split"]
+Norm = Literal["plain", "squared"]
+
+
+@dataclass
+class LossConfig:
+    """Which pose loss; the defaults are the thesis's eq. 2.1 and 3.7.
+
+    Eq. 4.4 is `form: split` with `orientation_weight` alpha; 5.3 the same with `normalize_quat`; 6.3 is
+    `split`, `squared`, with `orientation_weight` beta; 6.2 adds `trajectory_weight: 1`.
+
+    Attributes:
+        form: `joint` is the norm of the 7-vector's error, `split` the norm of the position's error plus
+            that of the quaternion's.
+        norm: `plain` is the Euclidean norm, `squared` its square.
+        orientation_weight: how much the quaternion counts: the factor of its term in `split` (alpha and
+            beta of the thesis), of its four elements in `joint`.
+        trajectory_weight: for clips, the factor of the norm of the positions' summed error; 0 leaves it out.
+        learned_weights: learn the balance of position and orientation (Kendall & Cipolla, CVPR 2017);
+            `split` only, `orientation_weight` stays 1.
+        normalize_quat: scale the predicted quaternion to unit length first.
+
+    Raises:
+        ConfigError: a value is out of range, or two contradict each other.
+    """
+
+    form: Form = "joint"
+    norm: Norm = "plain"
+    orientation_weight: float = 1.0
+    trajectory_weight: float = 0.0
+    learned_weights: bool = False
+    normalize_quat: bool = False
+
+    def __post_init__(self) -> None:
+        for name, choices in (("form", get_args(Form)), ("norm", get_args(Norm))):
+            if getattr(self, name) not in choices:
+                raise ConfigError(f"{name} is {getattr(self, name)!r}; give one of {', '.join(choices)}")
+        for name in ("orientation_weight", "trajectory_weight"):
+            weight = getattr(self, name)
+            if not (math.isfinite(weight) and weight >= 0):
+                raise ConfigError(f"{name} is {weight}; give a finite number, 0 or more")
+        if self.learned_weights and self.form != "split":
+            raise ConfigError(f"learned_weights needs two terms but form is {self.form!r}; set form: split")
+        if self.learned_weights and self.orientation_weight != 1:
+            raise ConfigError(
+                f"orientation_weight is {self.orientation_weight} but learned_weights learns it; "
+                "set orientation_weight: 1, or learned_weights: false"
+            )
+
+
+class PoseLoss(nn.Module):
+    """Position plus weighted orientation, as `LossConfig` says; each term a mean over batch and frames.
+
+    With learned weights the total is `L_p exp(-s_p) + s_p + L_q exp(-s_q) + s_q` (Kendall & Cipolla,
+    CVPR 2017), s_p and s_q starting at 0 and -3. Gradients are finite, zero, where an error is zero.
+
+    Args:
+        config: the loss's form and weights.
+    """
+
+    def __init__(self, config: LossConfig | None = None) -> None:
+        super().__init__()
+        self.config = config or LossConfig()
+        if self.config.learned_weights:
+            self.log_scale_position = nn.Parameter(torch.tensor(0.0))
+            self.log_scale_orientation = nn.Parameter(torch.tensor(-3.0))
+
+    def forward(
+        self, position_hat: Tensor, quat_hat: Tensor, position: Tensor, quat: Tensor
+    ) -> dict[str, Tensor]:
+        """Compare predicted poses with true ones.
+
+        Args:
+            position_hat: (..., 3) predicted; (B, T, 3) for clips.
+            quat_hat: (..., 4) predicted wxyz, as the network gives it.
+            position: (..., 3) true.
+            quat: (..., 4) true wxyz, unit, on one hemisphere.
+
+        Returns:
+            Scalars: `position` and `orientation`, unweighted; `trajectory`, unweighted, where it has a
+            weight; and `total`.
+
+        Raises:
+            ConfigError: shapes differ, or there is a trajectory weight but no time axis.
+        """
+        config = self.config
+        if position_hat.shape != position.shape or quat_hat.shape != quat.shape:
+            raise ConfigError(
+                f"predictions are {tuple(position_hat.shape)} and {tuple(quat_hat.shape)} but targets "
+                f"{tuple(position.shape)} and {tuple(quat.shape)}; give both the same shape"
+            )
+        if config.normalize_quat:
+            quat_hat = quat_normalize(quat_hat)
+        error_p, error_q = position_hat - position, quat_hat - quat
+        terms = {"position": self._norm(error_p).mean(), "orientation": self._norm(error_q).mean()}
+        if config.trajectory_weight:
+            terms["trajectory"] = self._trajectory(error_p)
+        drift = config.trajectory_weight * terms.get("trajectory", 0.0)
+        if config.form == "joint":
+            error = torch.cat([error_p, config.orientation_weight * error_q], dim=-1)
+            total = self._norm(error).mean() + drift
+        elif config.learned_weights:
+            s_p, s_q = self.log_scale_position, self.log_scale_orientation
+            total = (terms["position"] + drift) * torch.exp(-s_p) + s_p
+            total = total + terms["orientation"] * torch.exp(-s_q) + s_q
+        else:
+            total = terms["position"] + drift + config.orientation_weight * terms["orientation"]
+        return {**terms, "total": total}
+
+    def _norm(self, error: Tensor) -> Tensor:
+        # vector_norm has the gradient 0 at 0, where the square root of a sum of squares has NaN.
+        return (
+            error.square().sum(-1)
+            if self.config.norm == "squared"
+            else torch.linalg.vector_norm(error, dim=-1)
+        )
+
+    def _trajectory(self, error_p: Tensor) -> Tensor:
+        """The norm of the summed position error per frame.
+
+        Eq. 6.2 sums its position and orientation terms over the clip's T frames where we take the mean;
+        dividing this term by T as well keeps the thesis's proportions, so the total is eq. 6.2 over T.
+        """
+        if error_p.dim() < 3:
+            raise ConfigError(
+                f"trajectory_weight is {self.config.trajectory_weight} but the positions, "
+                f"{tuple(error_p.shape)}, have no time axis; use clips (B, T, 3) or set trajectory_weight: 0"
+            )
+        return self._norm(error_p.sum(-2)).mean() / error_p.shape[-2]

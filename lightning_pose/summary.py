@@ -1,0 +1,74 @@
+"""What is reported of a set of pose errors: median, mean, 95th percentile and recalls.
+
+Apart from `metrics`, because torchmetrics takes seconds to import and reports and baselines do without it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+
+from lightning_pose.errors import ConfigError
+
+__all__ = ["RECALL_THRESHOLDS", "summarize_errors"]
+
+RECALL_THRESHOLDS = {
+    "recall_1cm_1deg": (0.01, 1.0),
+    "recall_2cm_2deg": (0.02, 2.0),
+    "recall_5cm_5deg": (0.05, 5.0),
+    "recall_10cm_5deg": (0.10, 5.0),
+    "recall_25cm_2deg": (0.25, 2.0),
+    "recall_50cm_5deg": (0.50, 5.0),
+    "recall_5m_10deg": (5.0, 10.0),
+}
+"""Metric name to (metres, degrees): the share of frames within both, bounds included."""
+
+
+def summarize_errors(
+    position_error_m: torch.Tensor | np.ndarray, orientation_error_deg: torch.Tensor | np.ndarray
+) -> dict[str, float]:
+    """Median, mean and 95th percentile of both errors, and the recalls as fractions from 0 to 1.
+
+    The median is the mean of the middle two, percentiles are linearly interpolated. An error that is NaN
+    (a prediction that diverged) counts as infinite, so that it is never within a threshold.
+
+    Args:
+        position_error_m: any shape, metres.
+        orientation_error_deg: as many, degrees.
+
+    Returns:
+        `position_median_m`, `position_mean_m`, `position_p95_m`, `orientation_median_deg`,
+        `orientation_mean_deg`, `orientation_p95_deg` and the names of `RECALL_THRESHOLDS`.
+
+    Raises:
+        ConfigError: there are no errors, or not as many of one as of the other.
+    """
+    position, orientation = _flat(position_error_m), _flat(orientation_error_deg)
+    if not len(position) or len(position) != len(orientation):
+        raise ConfigError(
+            f"{len(position)} position errors and {len(orientation)} orientation errors cannot be summarised; "
+            "give one of each for at least one frame (is the split empty?)"
+        )
+    summary = {}
+    for name, unit, errors in (("position", "m", position), ("orientation", "deg", orientation)):
+        summary[f"{name}_median_{unit}"] = _quantile(errors, 0.5)
+        summary[f"{name}_mean_{unit}"] = float(errors.mean())
+        summary[f"{name}_p95_{unit}"] = _quantile(errors, 0.95)
+    for name, (metres, degrees) in RECALL_THRESHOLDS.items():
+        summary[name] = float(np.mean((position <= metres) & (orientation <= degrees)))
+    return summary
+
+
+def _flat(errors: torch.Tensor | np.ndarray) -> np.ndarray:
+    values = torch.as_tensor(errors).detach().cpu().double().flatten().numpy()
+    return np.where(np.isnan(values), np.inf, values)
+
+
+def _quantile(errors: np.ndarray, q: float) -> float:
+    """Linear interpolation that keeps infinities, of which np.quantile makes NaN."""
+    ordered = np.sort(errors)
+    place = q * (len(ordered) - 1)
+    below, above = ordered[math.floor(place)], ordered[math.ceil(place)]
+    return float(below if below == above else below + (above - below) * (place % 1))
