@@ -48,7 +48,7 @@ def summarize_errors(
     position, orientation = _flat(position_error_m), _flat(orientation_error_deg)
     if not len(position) or len(position) != len(orientation):
         raise ConfigError(
-            f"{len(position)} position errors and {len(orientation)} orientation errors cannot be summarised; "
+            f"{len(position)} position errors and {len(orientation)} orientation errors have no summary; "
             "give one of each for at least one frame (is the split empty?)"
         )
     summary = {}

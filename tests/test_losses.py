@@ -122,7 +122,7 @@ def test_gradient_is_finite_at_zero_error(form: str, norm: str, normalize_quat: 
         ({"learned_weights": True}, "form is 'joint'; set form: split"),
         (
             {"learned_weights": True, "form": "split", "orientation_weight": 10},
-            "orientation_weight is 10 .* set",
+            "weight is 10 .* set",
         ),
     ],
 )
