@@ -1,0 +1,173 @@
+"""The features that the thesis compares SURF with (fig. 3.5): SIFT, ORB, FREAK and BRIEF, by OpenCV."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+
+import cv2
+import numpy as np
+
+from lightning_pose.features.base import LocalExtractor, Record
+
+__all__ = ["BRIEF", "FREAK", "ORB", "SIFT"]
+
+Settings = Mapping[str, str | int | float | bool | None]
+Describe = Callable[[np.ndarray], tuple[Sequence[cv2.KeyPoint], np.ndarray | None]]
+
+_SMALLEST_SIDE = 8  # ORB's pyramid fails below it, and no detector here finds anything in such an image
+
+
+class _OpenCVExtractor(LocalExtractor):
+    """Orders what OpenCV finds, cuts it to `n_stored` rows and normalises it.
+
+    Rows are in falling order of response; equal responses (FAST's are integers) are ordered by y, x, size
+    and angle, so that the order does not depend on OpenCV's threads. Angles are 0..360, 0 where unknown.
+
+    Binary descriptors become one column a bit, -1 or +1 before normalising: the squared Euclidean
+    distance of two rows is 4/D of their Hamming distance.
+    """
+
+    @property
+    def settings(self) -> Settings:
+        # Another OpenCV may find other features, so its version keys the cache too.
+        return {"n_stored": self.n_stored, "opencv": cv2.__version__, **self._options()}
+
+    def extract(self, images: Sequence[np.ndarray]) -> list[Record]:
+        describe = self._describer()
+        return [self._record(image, describe) for image in images]
+
+    @abstractmethod
+    def _options(self) -> Settings:
+        """The settings of this kind of feature."""
+
+    @abstractmethod
+    def _describer(self) -> Describe:
+        """From an image to keypoints and (n, bytes) uint8 or (n, D) float32 descriptors (or None).
+
+        Made anew for each call of `extract`, as OpenCV's objects are not safe to share between threads.
+        """
+
+    def _record(self, image: np.ndarray, describe: Describe) -> Record:
+        keypoints = np.zeros((self.n_stored, 5), np.float32)
+        descriptors = np.zeros((self.n_stored, self.descriptor_dim), np.float32)
+        found, raw = describe(image) if min(image.shape) >= _SMALLEST_SIDE else ((), None)
+        count = min(len(found), self.n_stored)
+        if count and raw is not None:
+            rows = np.array([(*k.pt, k.size, k.response, k.angle) for k in found], np.float32)
+            rows[:, 4] = np.where(rows[:, 4] == -1, 0, rows[:, 4] % 360)  # OpenCV's -1: no angle
+            x, y, size, response, angle = rows.T
+            order = np.lexsort((angle, size, x, y, -response))[:count]
+            keypoints[:count] = rows[order]
+            descriptors[:count] = _normalised(raw[order])
+        return {
+            "descriptors": descriptors,
+            "keypoints": keypoints,
+            "count": np.array(count, np.int64),
+            "image_size": np.array(image.shape[::-1], np.int64),
+        }
+
+
+def _normalised(raw: np.ndarray) -> np.ndarray:
+    """(n, D) float32 unit rows, out of float rows or of packed bits."""
+    rows = np.unpackbits(raw, axis=1) * np.float32(2) - 1 if raw.dtype == np.uint8 else raw
+    norms = np.linalg.norm(rows, axis=1, keepdims=True)
+    return rows / np.maximum(norms, np.finfo(np.float32).tiny)
+
+
+class SIFT(_OpenCVExtractor):
+    """Scale-invariant feature transform (Lowe 2004), 128 columns.
+
+    Args:
+        n_features: N, how many of the strongest features the networks read.
+        with_geometry: append normalised x, y, log size and response.
+        contrast_threshold: Lowe's; lower finds more features in plain images (OpenCV's default).
+    """
+
+    descriptor_dim = 128
+
+    def __init__(
+        self, n_features: int = 300, with_geometry: bool = False, contrast_threshold: float = 0.04
+    ) -> None:
+        super().__init__(n_features, with_geometry)
+        self.contrast_threshold = contrast_threshold
+
+    def _options(self) -> Settings:
+        return {"contrast_threshold": self.contrast_threshold}
+
+    def _describer(self) -> Describe:
+        sift = cv2.SIFT.create(self.n_stored, contrastThreshold=self.contrast_threshold)
+        return lambda image: sift.detectAndCompute(image, None)
+
+
+class ORB(_OpenCVExtractor):
+    """Oriented FAST and rotated BRIEF (Rublee et al. 2011), 256 columns; the response is Harris's.
+
+    Each level of its pyramid has a quota of the `n_stored` features, so N above `MIN_STORED_FEATURES` may
+    change which features are the strongest.
+
+    Args:
+        n_features: N, how many of the strongest features the networks read.
+        with_geometry: append normalised x, y, log size and response.
+        fast_threshold: gray levels by which a corner stands out (OpenCV's default).
+    """
+
+    descriptor_dim = 256
+
+    def __init__(self, n_features: int = 300, with_geometry: bool = False, fast_threshold: int = 20) -> None:
+        super().__init__(n_features, with_geometry)
+        self.fast_threshold = fast_threshold
+
+    def _options(self) -> Settings:
+        return {"fast_threshold": self.fast_threshold}
+
+    def _describer(self) -> Describe:
+        orb = cv2.ORB.create(self.n_stored, fastThreshold=self.fast_threshold)
+        return lambda image: orb.detectAndCompute(image, None)
+
+
+class _FastCorners(_OpenCVExtractor):
+    """Descriptors without a detector of their own, at FAST corners (Rosten and Drummond 2006).
+
+    FAST, because it alone fills 300 rows of ordinary indoor frames for both: STAR finds a third of that,
+    and of ORB's large keypoints FREAK discards three quarters, as its pattern leaves the image. Corners too
+    near the border to be described are dropped before the strongest are taken.
+
+    Args:
+        n_features: N, how many of the strongest features the networks read.
+        with_geometry: append normalised x, y, log size and response.
+        fast_threshold: gray levels by which a corner stands out (OpenCV's default).
+    """
+
+    def __init__(self, n_features: int = 300, with_geometry: bool = False, fast_threshold: int = 10) -> None:
+        super().__init__(n_features, with_geometry)
+        self.fast_threshold = fast_threshold
+
+    def _options(self) -> Settings:
+        return {"detector": "fast", "fast_threshold": self.fast_threshold}
+
+    def _describer(self) -> Describe:
+        fast, descriptor = cv2.FastFeatureDetector.create(self.fast_threshold), self._descriptor()
+        return lambda image: descriptor.compute(image, fast.detect(image))
+
+    @abstractmethod
+    def _descriptor(self) -> cv2.Feature2D:
+        """OpenCV's descriptor."""
+
+
+class FREAK(_FastCorners):
+    """Fast retina keypoint (Alahi et al. 2012), 512 columns, at FAST corners, each in its orientation."""
+
+    descriptor_dim = 512
+
+    def _descriptor(self) -> cv2.Feature2D:
+        return cv2.xfeatures2d.FREAK.create()
+
+
+class BRIEF(_FastCorners):
+    """Binary robust independent elementary features (Calonder et al. 2010), 256 columns, at FAST corners."""
+
+    descriptor_dim = 256
+
+    def _descriptor(self) -> cv2.Feature2D:
+        return cv2.xfeatures2d.BriefDescriptorExtractor.create(32)
