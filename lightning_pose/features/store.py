@@ -1,0 +1,85 @@
+"""One record, one file: written whole or not at all, and read back only if it is what was written."""
+
+from __future__ import annotations
+
+import uuid
+import zlib
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
+
+from lightning_pose.errors import CacheError
+from lightning_pose.features.base import Record
+
+__all__ = ["TEMPORARY", "DamagedError", "read_record", "write_record", "write_whole"]
+
+TEMPORARY = ".tmp"
+"""Suffix of a file that is being written."""
+
+
+class DamagedError(Exception):
+    """A file whose content is not what was written."""
+
+
+def read_record(file: Path) -> Record | None:
+    """Read a record; None if there is no such file.
+
+    Raises:
+        DamagedError: the file is cut short or altered.
+        CacheError: the file may not be read.
+    """
+    try:
+        with safe_open(file, framework="numpy") as opened:
+            record = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
+            written = (opened.metadata() or {}).get("checksum")
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise CacheError(f"{file} cannot be read ({error}); check its permissions, or delete it") from error
+    except (SafetensorError, ValueError, TypeError) as error:
+        raise DamagedError(error) from error
+    if written != _checksum(record):
+        raise DamagedError("its checksum differs")
+    return record
+
+
+def write_record(file: Path, record: Record) -> None:
+    """Write a record as a safetensors file with its checksum in the metadata.
+
+    Raises:
+        CacheError: as `write_whole`.
+    """
+    write_whole(file, save(record, {"checksum": _checksum(record)}))
+
+
+def write_whole(file: Path, data: bytes) -> None:
+    """Write a file so that nobody ever sees a part of it; its folder is made.
+
+    Raises:
+        CacheError: the folder cannot be written, or the disk is full.
+    """
+    temporary = file.with_name(uuid.uuid4().hex + TEMPORARY)
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        temporary.write_bytes(data)
+        temporary.replace(file)
+    except OSError as error:
+        with suppress(OSError):
+            temporary.unlink()
+        raise CacheError(
+            f"cannot write to the feature cache in {file.parent} ({error.strerror}); free some space, or set "
+            "LIGHTNING_POSE_CACHE to a folder that can be written"
+        ) from error
+
+
+def _checksum(record: Record) -> str:
+    """CRC-32 of every array's name, type, shape and bytes."""
+    crc = 0
+    for name in sorted(record):
+        array = np.asarray(record[name], order="C")
+        crc = zlib.crc32(f"{name} {array.dtype} {array.shape}".encode(), crc)
+        crc = zlib.crc32(array.data, crc)
+    return f"{crc:08x}"
