@@ -81,9 +81,7 @@ class PoseLoss(nn.Module):
             self.log_scale_position = nn.Parameter(torch.tensor(0.0))
             self.log_scale_orientation = nn.Parameter(torch.tensor(-3.0))
 
-    def forward(
-        self, position_hat: Tensor, quat_hat: Tensor, position: Tensor, quat: Tensor
-    ) -> dict[str, Tensor]:
+    def forward(self, position_hat: Tensor, quat_hat: Tensor, position: Tensor, quat: Tensor) -> dict[str, Tensor]:
         """Compare predicted poses with true ones.
 
         Args:
@@ -124,12 +122,10 @@ class PoseLoss(nn.Module):
         return {**terms, "total": total}
 
     def _norm(self, error: Tensor) -> Tensor:
-        # vector_norm has the gradient 0 at 0, where the square root of a sum of squares has NaN.
-        return (
-            error.square().sum(-1)
-            if self.config.norm == "squared"
-            else torch.linalg.vector_norm(error, dim=-1)
-        )
+        if self.config.norm == "squared":
+            return error.square().sum(-1)
+        # Its gradient at 0 is 0, where the square root of a sum of squares has NaN.
+        return torch.linalg.vector_norm(error, dim=-1)
 
     def _trajectory(self, error_p: Tensor) -> Tensor:
         """The norm of the summed position error per frame.
