@@ -1,0 +1,118 @@
+"""Hand-held walks through the synthetic room: smooth splines in one volume, looking at one region."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+__all__ = ["Walk", "is_test", "make_walks"]
+
+FRAMES_PER_KNOT = 8
+STEP_M = 0.3
+"""How far the camera moves from knot to knot, and at most the point it looks at."""
+
+
+@dataclass(frozen=True)
+class Walk:
+    """One sequence's motion as splines over time in frames.
+
+    Attributes:
+        position_m: (K, 3) knots of the camera centre.
+        target_m: (K, 3) knots of the point it looks at.
+        roll_rad: (K, 1) knots of the roll.
+        tremor: (J, 6) knots of the hand's tremor, two frames apart: metres, radians.
+        length: number of frames.
+    """
+
+    position_m: np.ndarray
+    target_m: np.ndarray
+    roll_rad: np.ndarray
+    tremor: np.ndarray
+    length: int
+
+    def pose(self, frame: float) -> np.ndarray:
+        """(4, 4) camera-to-world at a moment, in frames from the start; x right, y down, z forward."""
+        knot = frame / FRAMES_PER_KNOT
+        tremor = _spline(self.tremor, frame / 2)
+        position = _spline(self.position_m, knot) + tremor[:3]
+        forward = _spline(self.target_m, knot) - position
+        forward /= np.linalg.norm(forward)
+        right = np.cross(forward, (0, 0, 1))
+        right /= np.linalg.norm(right)
+        shake = _rotation(tremor[3:] + np.array([0, 0, 1]) * _spline(self.roll_rad, knot))
+        pose = np.eye(4)
+        pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1) @ shake
+        pose[:3, 3] = position
+        return pose
+
+
+def is_test(sequence: int) -> bool:
+    """Whether a sequence, counted from 0, is held out: the third of every five."""
+    return sequence % 5 == 2
+
+
+def make_walks(seed: int, size_m: np.ndarray, lengths: list[int]) -> list[Walk]:
+    """One walk per sequence, all in the same volume of about 3 x 2 x 0.6 m, looking at the far wall.
+
+    Training walks explore: each knot is the one of several candidates that is farthest, in position and
+    in the point looked at, from the knots of all earlier ones. Test walks wander at random.
+    """
+    rng = np.random.default_rng([seed, 1])
+    near, far = -size_m[1] / 2 + 0.4, size_m[1] / 2
+    low = np.array([-1.5, near, 1.1, -1.3, far, 0.9])
+    high = np.array([1.5, near + 2, 1.7, 1.3, far, 1.5])
+    seen = np.zeros((0, 6))
+    walks = []
+    for sequence, length in enumerate(lengths):
+        knots = _wander(rng, low, high, length // FRAMES_PER_KNOT + 5, seen, 1 if is_test(sequence) else 24)
+        if not is_test(sequence):
+            seen = np.concatenate([seen, knots])
+        roll = np.radians(rng.uniform(-5, 5, (len(knots), 1)))
+        tremor = 0.003 * rng.standard_normal((length // 2 + 5, 6))
+        walks.append(Walk(knots[:, :3], knots[:, 3:], roll, tremor, length))
+    return walks
+
+
+def _wander(
+    rng: np.random.Generator, low: np.ndarray, high: np.ndarray, count: int, seen: np.ndarray, candidates: int
+) -> np.ndarray:
+    """(count, 6) knots of position and target within bounds, a step apart, turning gently."""
+
+    def novel(options: np.ndarray) -> int:
+        if not len(seen):
+            return 0
+        weights = np.array([1, 1, 0.7, 0.6, 0, 0.3])
+        return int(np.linalg.norm((options[:, None] - seen) * weights, axis=-1).min(1).argmax())
+
+    starts = rng.uniform(low, high, (candidates, 6))
+    knots = [starts[novel(starts)]]
+    heading = rng.standard_normal(6)
+    for _ in range(count - 1):
+        turns = heading + 0.8 * rng.standard_normal((candidates, 6)) * (1, 1, 0.4, 1, 0, 0.5)
+        for part in (slice(0, 3), slice(3, 6)):
+            turns[:, part] *= STEP_M / np.linalg.norm(turns[:, part], axis=1, keepdims=True)
+        # A step that would leave the volume turns back, axis by axis.
+        ahead = knots[-1] + turns
+        turns = np.where((ahead < low) | (ahead > high), -turns, turns)
+        options = np.clip(knots[-1] + turns, low, high)
+        best = novel(options)
+        heading = turns[best] / STEP_M
+        knots.append(options[best])
+    return np.array(knots)
+
+
+def _spline(knots: np.ndarray, at: float) -> np.ndarray:
+    """Uniform Catmull-Rom spline; time 0 lies at the third knot, so that blur may look a little back."""
+    i = int(np.floor(at)) + 2
+    f = at - np.floor(at)
+    a, b, c, d = knots[i - 1 : i + 3]
+    return b + 0.5 * f * (c - a + f * (2 * a - 5 * b + 4 * c - d + f * (3 * (b - c) + d - a)))
+
+
+def _rotation(vector: np.ndarray) -> np.ndarray:
+    """Rodrigues: the rotation by |vector| radians about it."""
+    angle = float(np.linalg.norm(vector)) + 1e-12
+    x, y, z = vector / angle
+    K = np.array([(0, -z, y), (z, 0, -x), (-y, x, 0)])
+    return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
