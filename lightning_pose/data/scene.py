@@ -56,6 +56,7 @@ class Scene:
         format: name of the adapter that read it.
         frames: every frame; those of one sequence are consecutive and in order.
         splits: frame indices of each of `SPLITS`; disjoint.
+        split_source: `official` where the dataset has a split, `blocks` where the trajectory was cut.
         unit: unit of the positions: `m`, or `scene` where the scale is arbitrary.
         ground_truth: where the poses come from (`original`, `sfm`, `synthetic`, ...).
     """
@@ -65,5 +66,6 @@ class Scene:
     format: str
     frames: tuple[Frame, ...]
     splits: Mapping[str, np.ndarray] = field(default_factory=dict)
+    split_source: str = "official"
     unit: str = "m"
     ground_truth: str = "original"

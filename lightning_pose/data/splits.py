@@ -30,9 +30,7 @@ MAX_BLOCKS = 4
 MIN_BLOCK = 15
 
 
-def make_splits(
-    scene: Scene, val_fraction: float = 0.1, test_fraction: float = 0.2
-) -> Mapping[str, np.ndarray]:
+def make_splits(scene: Scene, val_fraction: float, test_fraction: float) -> Mapping[str, np.ndarray]:
     """Ascending frame indices of `train`, `val` and `test`, disjoint.
 
     Args:

@@ -44,7 +44,8 @@ def load_scene(
     if not root.is_dir():
         raise DataError(f"{root} is not a folder; give the folder of a scene")
     scene = _format(root, format).read(root)
-    return replace(scene, splits=make_splits(scene, val_fraction, test_fraction))
+    source = "official" if scene.splits else "blocks"
+    return replace(scene, splits=make_splits(scene, val_fraction, test_fraction), split_source=source)
 
 
 def _format(root: Path, name: str | None) -> SceneFormat:

@@ -40,9 +40,7 @@ class Cambridge(SceneFormat):
         rows = {split: _read_list(root / file) for split, file in SPLIT_FILES.items()}
         frames, split_of = _frames(root, rows)
         splits = {
-            split: np.array(
-                [i for i, frame in enumerate(frames) if split_of[frame.image] == split], dtype=int
-            )
+            split: np.array([i for i, frame in enumerate(frames) if split_of[frame.image] == split], dtype=int)
             for split in SPLIT_FILES
         }
         for split, file in SPLIT_FILES.items():
@@ -90,8 +88,7 @@ def _frames(root: Path, rows: dict[str, list[Row]]) -> tuple[tuple[Frame, ...], 
     quats = Rotation.from_quat(quats, scalar_first=True).inv().as_quat(canonical=True, scalar_first=True)
     kept = _near_median(root, poses[:, :3])
     frames = [
-        Frame(root / listed[i][0], poses[i, :3], quats[i], *_sequence_and_index(root, listed[i][0]))
-        for i in kept
+        Frame(root / listed[i][0], poses[i, :3], quats[i], *_sequence_and_index(root, listed[i][0])) for i in kept
     ]
     require_images((frame.image for frame in frames), " or ".join(SPLIT_FILES.values()))
     return ordered(frames), split_of

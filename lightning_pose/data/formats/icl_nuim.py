@@ -65,9 +65,7 @@ class IclNuim(SceneFormat):
             log.warning("%s: dropped %d of %d images, no pose", root, len(images) - len(posed), len(images))
         require_images((images[number] for number in posed), "the image list")
         rows = [row_of[number] for number in posed]
-        positions, quats = reflect(
-            table[rows, 1:4], unit_quats(table[:, 4:], where, scalar_first=False)[rows]
-        )
+        positions, quats = reflect(table[rows, 1:4], unit_quats(table[:, 4:], where, scalar_first=False)[rows])
         name = root.resolve().name
         frames = tuple(
             Frame(images[number], position, quat, name, number, number / FRAMES_PER_SECOND, CAMERA)

@@ -36,9 +36,7 @@ class SevenScenes(SceneFormat):
     def read(self, root: Path) -> Scene:
         split_of = _split_of_sequences(root)
         intrinsics = _intrinsics(root)
-        frames = ordered(
-            frame for sequence in split_of for frame in _read_sequence(root / sequence, intrinsics)
-        )
+        frames = ordered(frame for sequence in split_of for frame in _read_sequence(root / sequence, intrinsics))
         splits = {
             split: np.array([i for i, frame in enumerate(frames) if split_of[frame.sequence] == split])
             for split in SPLIT_FILES

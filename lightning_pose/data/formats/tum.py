@@ -49,9 +49,7 @@ class Tum(SceneFormat):
                 f"rgb.txt spans {_span(times)}, groundtruth.txt {_span(table[:, 0])}; bring both to one clock"
             )
         if len(pairs) < len(times):
-            log.warning(
-                "%s: dropped %d of %d images, no pose within 20 ms", root, len(times) - len(pairs), len(times)
-            )
+            log.warning("%s: dropped %d of %d images, no pose within 20 ms", root, len(times) - len(pairs), len(times))
         quats = unit_quats(table[:, 4:], where, scalar_first=False)
         name = root.resolve().name
         intrinsics = next((camera for key, camera in CAMERAS.items() if key in name), None)
