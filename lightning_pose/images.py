@@ -13,9 +13,7 @@ from lightning_pose.errors import ImageError
 __all__ = ["decode_image", "read_bytes", "read_gray", "read_rgb", "to_gray"]
 
 if "OPENCV_LOG_LEVEL" not in os.environ:
-    cv2.utils.logging.setLogLevel(
-        1
-    )  # fatal only: what OpenCV would print about a bad file, ImageError says once
+    cv2.utils.logging.setLogLevel(1)  # fatal only: what OpenCV would print about a bad file, ImageError says once
 
 # Poses and intrinsics of a dataset refer to the pixels as stored, so EXIF never turns an image.
 _FLAGS = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
@@ -50,9 +48,7 @@ def read_bytes(path: Path | str) -> bytes:
     try:
         data = Path(path).read_bytes()
     except FileNotFoundError:
-        raise ImageError(
-            f"{path} does not exist; check the path, or remove the frame from the dataset"
-        ) from None
+        raise ImageError(f"{path} does not exist; check the path, or remove the frame from the dataset") from None
     except IsADirectoryError:
         raise ImageError(f"{path} is a folder; give the path of one image file") from None
     except OSError as error:
@@ -105,9 +101,7 @@ def to_gray(image: np.ndarray) -> np.ndarray:
     if np.issubdtype(image.dtype, np.floating):
         low, high = float(image.min()), float(image.max())
         if not (low >= 0 and high <= 1):  # written so that NaN is refused too
-            raise ImageError(
-                f"a {image.dtype} image with values {low:g}..{high:g}; scale it to 0..1, or give uint8"
-            )
+            raise ImageError(f"a {image.dtype} image with values {low:g}..{high:g}; scale it to 0..1, or give uint8")
     elif image.dtype not in (np.uint8, np.uint16):
         raise ImageError(f"a {image.dtype} image; give uint8, uint16, or floats in 0..1")
     image = _to_uint8(image)

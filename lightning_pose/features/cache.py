@@ -24,6 +24,7 @@ from rich.text import Text
 from lightning_pose.errors import ConfigError, ImageError
 from lightning_pose.features.base import FeatureExtractor, Record
 from lightning_pose.features.store import TEMPORARY, DamagedError, read_record, write_record, write_whole
+from lightning_pose.folders import cache_folder
 from lightning_pose.images import decode_image, read_bytes
 
 __all__ = ["FeatureCache", "FillReport"]
@@ -78,14 +79,12 @@ class FeatureCache:
 
     def __init__(self, extractor: FeatureExtractor, root: ImagePath | None = None) -> None:
         self.extractor = extractor
-        self.root = Path(root).expanduser() if root else _default_root()
+        self.root = Path(root).expanduser() if root else cache_folder("features")
         self._about = {"format": _FORMAT, "name": extractor.name, "settings": dict(extractor.settings)}
         canonical = json.dumps(self._about, sort_keys=True, separators=(",", ":"))
         self.folder = self.root / f"{extractor.name}-{_digest(canonical.encode(), 8)}"
 
-    def fill(
-        self, paths: Sequence[ImagePath], workers: int | None = None, progress: bool = True
-    ) -> FillReport:
+    def fill(self, paths: Sequence[ImagePath], workers: int | None = None, progress: bool = True) -> FillReport:
         """Extract what the cache lacks; a run that was stopped goes on where it was.
 
         Args:
@@ -100,9 +99,7 @@ class FeatureCache:
         """
         return self._visit(paths, lambda numbers, record: None, workers, progress)
 
-    def features(
-        self, paths: Sequence[ImagePath], workers: int | None = None, progress: bool = True
-    ) -> np.ndarray:
+    def features(self, paths: Sequence[ImagePath], workers: int | None = None, progress: bool = True) -> np.ndarray:
         """(len(paths), *extractor.feature_shape) float32, what the networks read; `fill` is included."""
         rows = np.empty((len(paths), *self.extractor.feature_shape), np.float32)
 
@@ -127,9 +124,7 @@ class FeatureCache:
             self._visit(chunk, put, workers, progress=False)
             yield from (found[number] for number in range(len(chunk)))
 
-    def _visit(
-        self, paths: Sequence[ImagePath], visit: Visit, workers: int | None, progress: bool
-    ) -> FillReport:
+    def _visit(self, paths: Sequence[ImagePath], visit: Visit, workers: int | None, progress: bool) -> FillReport:
         """Show `visit` the record of every distinct image, read from disk or else extracted and saved."""
         if workers is not None and workers < 1:
             raise ConfigError(f"workers is {workers}; give the number of threads to extract with, 1 or more")
@@ -141,7 +136,7 @@ class FeatureCache:
             job.extract(progress)
         done = job.computed + job.redone
         if job.bad:
-            raise ImageError(_told(list(job.bad.values()), len(paths)))
+            raise ImageError(_told([job.bad[number] for number in sorted(job.bad)], len(paths)))
         return FillReport(
             total=len(paths),
             computed=job.computed,
@@ -189,9 +184,7 @@ class _Job:
                 if key:
                     self.numbers.setdefault(key, []).append(number)
             held = list(pool.map(self._held, self.numbers))
-        self.missing = {
-            key for key, there in zip(self.numbers, held, strict=True) if not there
-        } - self.damaged
+        self.missing = {key for key, there in zip(self.numbers, held, strict=True) if not there} - self.damaged
 
     def extract(self, progress: bool) -> None:
         """Extract, save and visit all that is missing or damaged, in batches spread over the threads."""
@@ -271,13 +264,6 @@ def _prepare(folder: Path, about: str) -> None:
 
 def _digest(data: bytes, size: int = 20) -> str:
     return hashlib.blake2b(data, digest_size=size).hexdigest()
-
-
-def _default_root() -> Path:
-    base = os.environ.get("LIGHTNING_POSE_CACHE")
-    if base is None:
-        base = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache") / "lightning_pose"
-    return Path(base).expanduser() / "features"
 
 
 def _cores() -> int:

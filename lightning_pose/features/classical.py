@@ -86,9 +86,7 @@ class SIFT(_OpenCVExtractor):
 
     descriptor_dim = 128
 
-    def __init__(
-        self, n_features: int = 300, with_geometry: bool = False, contrast_threshold: float = 0.04
-    ) -> None:
+    def __init__(self, n_features: int = 300, with_geometry: bool = False, contrast_threshold: float = 0.04) -> None:
         super().__init__(n_features, with_geometry)
         self.contrast_threshold = contrast_threshold
 

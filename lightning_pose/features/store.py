@@ -52,6 +52,8 @@ def write_record(file: Path, record: Record) -> None:
     Raises:
         CacheError: as `write_whole`.
     """
+    # safetensors writes the memory of an array as it lies, transposed if the array is.
+    record = {name: np.asarray(array, order="C") for name, array in record.items()}
     write_whole(file, save(record, {"checksum": _checksum(record)}))
 
 
@@ -79,7 +81,7 @@ def _checksum(record: Record) -> str:
     """CRC-32 of every array's name, type, shape and bytes."""
     crc = 0
     for name in sorted(record):
-        array = np.asarray(record[name], order="C")
+        array = record[name]
         crc = zlib.crc32(f"{name} {array.dtype} {array.shape}".encode(), crc)
         crc = zlib.crc32(array.data, crc)
     return f"{crc:08x}"
