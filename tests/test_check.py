@@ -47,7 +47,7 @@ def test_sound_dataset(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
         "32x24",
         "9.00 x 2.00 x 0.00 m",
         "median 1 m, 0 deg",  # the spacing, and the test's distance from the sequence beside it
-        "up to 2.24 m",  # validation took the two nearest frames of that sequence
+        "up to 2 m",  # validation took the frames beside the first two
         "usable as it is",
     ):
         assert text in printed
