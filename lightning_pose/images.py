@@ -16,7 +16,7 @@ if "OPENCV_LOG_LEVEL" not in os.environ:
     cv2.utils.logging.setLogLevel(1)  # fatal only: what OpenCV would print about a bad file, ImageError says once
 
 # Poses and intrinsics of a dataset refer to the pixels as stored, so EXIF never turns an image.
-_FLAGS = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+_FLAGS = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 
 
 def read_gray(path: Path | str) -> np.ndarray:
@@ -69,9 +69,8 @@ def decode_image(data: bytes, path: Path | str, color: bool) -> np.ndarray:
     Raises:
         ImageError: the bytes are not an image, are cut short, or hold neither 8 nor 16 bits a channel.
     """
-    flags = _FLAGS | (cv2.IMREAD_COLOR_RGB if color else cv2.IMREAD_GRAYSCALE)
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), _FLAGS)
     except cv2.error:
         image = None
     if image is None:
@@ -81,7 +80,10 @@ def decode_image(data: bytes, path: Path | str, color: bool) -> np.ndarray:
         )
     if image.dtype not in (np.uint8, np.uint16):
         raise ImageError(f"{path} holds {image.dtype} pixels; convert it to 8 or 16 bits a channel")
-    return _to_uint8(image)
+    image = _to_uint8(image)
+    # Each decoder weighs colour a little differently when asked for gray; this way a file, and the same
+    # pixels in memory, give the same gray.
+    return image if color else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
 
 
 def to_gray(image: np.ndarray) -> np.ndarray:
