@@ -137,8 +137,8 @@ def test_name_that_no_file_can_have(tmp_path: Path) -> None:
 
 
 def test_float_pixels_are_refused(tmp_path: Path) -> None:
-    path = save(tmp_path / "depth.tif", np.ones((4, 5), np.float32))
-    with pytest.raises(ImageError, match=r"depth\.tif holds float32 pixels; convert it to 8 or 16 bits"):
+    path = save(tmp_path / "light.hdr", np.ones((4, 5, 3), np.float32))
+    with pytest.raises(ImageError, match=r"light\.hdr holds float32 pixels; convert it to 8 or 16 bits"):
         read_gray(path)
 
 
