@@ -1,0 +1,69 @@
+"""The command line: verbs and their mains; each verb imports only what it needs."""
+
+from __future__ import annotations
+
+import difflib
+import sys
+from importlib import import_module
+
+from lightning_pose.errors import PoseError
+
+__all__ = ["main"]
+
+VERBS = {
+    "fit": ("lightning_pose.cli", "train a localizer, test it, and print it beside its baselines"),
+    "validate": ("lightning_pose.cli", "measure a checkpoint on the validation frames"),
+    "test": ("lightning_pose.cli", "measure a checkpoint on the test frames, beside its baselines"),
+    "predict": ("lightning_pose.cli", "write a checkpoint's poses of the test frames as TUM files"),
+    "extract": ("lightning_pose.extract", "fill the feature cache: parallel, resumable"),
+    "check": ("lightning_pose.check", "say what a dataset holds, and what is wrong with it"),
+    "synth": ("lightning_pose.synth", "render a synthetic room as a dataset"),
+}
+
+USAGE = """usage: python -m lightning_pose VERB [options]
+
+Cheap camera localization: a folder of posed images in, a trained and measured localizer out.
+
+{verbs}
+
+Start with    python -m lightning_pose fit --config configs/quickstart.yaml
+Your data     python -m lightning_pose fit --config configs/surf_lstm.yaml --data.root DIR
+Every option  python -m lightning_pose VERB --help"""
+
+
+def usage() -> str:
+    """The page that `--help` prints."""
+    return USAGE.format(verbs="\n".join(f"  {verb:10}{says}" for verb, (_, says) in VERBS.items()))
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run one verb.
+
+    Returns:
+        The exit code: 0 done, 2 the user's mistake, 130 interrupted. An internal error keeps its traceback.
+    """
+    argv = sys.argv[1:] if argv is None else argv
+    if not argv or argv[0] in ("-h", "--help"):
+        print(usage())
+        return 0 if argv else 2
+    verb = argv[0]
+    if verb not in VERBS:
+        near = difflib.get_close_matches(verb, VERBS, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"choose one of {', '.join(VERBS)}"
+        print(f"error: there is no verb {verb!r}; {hint}", file=sys.stderr)
+        return 2
+    try:
+        return import_module(VERBS[verb][0]).main(argv if verb in LIGHTNING_VERBS else argv[1:])
+    except PoseError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
+
+
+LIGHTNING_VERBS = tuple(verb for verb, (module, _) in VERBS.items() if module == "lightning_pose.cli")
+"""Verbs that LightningCLI parses, as its subcommands."""
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,179 @@
+"""PoseCLI: LightningCLI for fit, validate, test and predict, with the project's defaults and resuming."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import warnings
+from pathlib import Path
+from typing import Any, NoReturn
+
+import torch
+import yaml
+from lightning import LightningDataModule, Trainer
+from lightning.pytorch.callbacks import Timer
+from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
+from lightning.pytorch.utilities.exceptions import SIGTERMException
+
+from lightning_pose.callbacks import BestCheckpoint, LastCheckpoint, RunRecorder, checkpoint_folder
+from lightning_pose.errors import CheckpointError, ConfigError
+from lightning_pose.evaluation import TestReport
+from lightning_pose.localize import read_checkpoint
+from lightning_pose.models import PoseModule
+from lightning_pose.progress import EpochBar
+from lightning_pose.tracking import default_tracking_uri, last_run
+from lightning_pose.tum import write_sequences
+
+__all__ = ["PoseCLI", "main"]
+
+
+class PoseParser(LightningArgumentParser):
+    """A parser that raises ConfigError, so that a wrong setting ends in one line, like any other mistake."""
+
+    def error(self, message: str, ex: Exception | None = None) -> NoReturn:
+        raise ConfigError(_one_line(message)) from ex
+
+
+def _one_line(message: str) -> str:
+    """jsonargparse explains itself over many lines; its first ones say which setting and what is wrong with it."""
+    lines = [line.strip(" -") for line in message.splitlines() if line.strip()]
+    return " ".join(lines)
+
+
+class PoseCLI(LightningCLI):
+    """`python -m lightning_pose fit | validate | test | predict`.
+
+    Args:
+        args: the command line, verb first; without the verb if `run` is False.
+        run: run the verb; otherwise only build what the config describes.
+    """
+
+    def __init__(self, args: list[str], run: bool = True) -> None:
+        self.recorder = RunRecorder()
+        super().__init__(
+            model_class=PoseModule,
+            datamodule_class=LightningDataModule,
+            subclass_mode_model=True,
+            subclass_mode_data=True,
+            save_config_callback=None,  # it asserts with a database logger; the recorder keeps the config
+            trainer_defaults={
+                # The recorder comes first: a run has its name and tags before anything else can fail.
+                "callbacks": [self.recorder, Timer(), LastCheckpoint(), EpochBar()],
+                "logger": {"class_path": "lightning_pose.tracking.MLflowLogger"},
+                "default_root_dir": "mlruns",
+                "enable_model_summary": False,
+                "log_every_n_steps": 1,
+            },
+            seed_everything_default=0,
+            auto_configure_optimizers=False,
+            load_from_checkpoint_support=False,  # checkpoints carry their own plain settings
+            parser_class=PoseParser,
+            args=_with_saved_config(args) if run else args,
+            run=run,
+        )
+
+    def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
+        parser.link_arguments("data.input_shape", "model.init_args.input_shape", apply_on="instantiate")
+        parser.add_lightning_class_args(BestCheckpoint, "best")
+        parser.add_lightning_class_args(TestReport, "report")
+
+    def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
+        self.config = parser.parse_args(args)  # Lightning's own warns that sys.argv is given as well
+
+    def _parse_ckpt_path(self) -> None:
+        """Nothing: `_with_saved_config` has taken the settings out of the checkpoint already."""
+
+    def before_instantiate_classes(self) -> None:
+        if self.subcommand in ("validate", "predict"):
+            self.config[self.subcommand].trainer.logger = False  # a look at a checkpoint is no run
+        elif self.subcommand == "fit" and self.config.fit.ckpt_path == "last":
+            self._continue_last_run()
+
+    def _continue_last_run(self) -> None:
+        config = self.config.fit
+        logger = config.trainer.logger
+        if not logger:
+            raise ConfigError("trainer.logger is off, so no run is known; name the checkpoint in --ckpt_path")
+        run_id, checkpoint = last_run(
+            uri=logger.init_args.tracking_uri or default_tracking_uri(logger.init_args.root),
+            experiment_name=logger.init_args.experiment_name,
+            checkpoints=Path(config.trainer.default_root_dir) / "checkpoints",
+            architecture=config.model.class_path.rpartition(".")[2],
+            root=str(config.data.init_args.root),
+        )
+        logger.init_args.run_id = run_id
+        config.ckpt_path = str(checkpoint)
+
+    def instantiate_trainer(self, **kwargs: Any) -> Trainer:
+        config = self.config if self.subcommand is None else self.config[self.subcommand]
+        self.recorder.config_yaml = self._parser(self.subcommand).dump(config, skip_none=False)
+        return super().instantiate_trainer(**kwargs)
+
+    def after_fit(self) -> None:
+        """Test the best checkpoint, in the same run."""
+        best = checkpoint_folder(self.trainer) / "best.ckpt"
+        self.trainer.test(self.model, datamodule=self.datamodule, ckpt_path=str(best), verbose=False)
+
+    def predict(self, model: PoseModule, datamodule: Any, **kwargs: Any) -> None:
+        """Write one TUM file a sequence of the test split."""
+        batches = self.trainer.predict(model, datamodule=datamodule, **kwargs) or []
+        position_m, quat_wxyz = (torch.cat(parts).numpy() for parts in zip(*batches, strict=True))
+        scene = datamodule.scene
+        frames = [scene.frames[i] for i in scene.splits["test"]]
+        folder = Path(self.trainer.default_root_dir) / "predictions" / f"{type(model).__name__}-{scene.name}"
+        for file in write_sequences(folder, frames, position_m, quat_wxyz):
+            print(file)
+
+
+def _with_saved_config(args: list[str]) -> list[str]:
+    """Put the checkpoint's own settings into the command line of a verb that only reads it.
+
+    Its architecture replaces the config's, which may have other widths; its data settings serve where no config is
+    given. Options on the command line still win.
+    """
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--ckpt_path")
+    parser.add_argument("--config", "-c", action="append", default=[])
+    options, rest = parser.parse_known_args(args[1:])
+    if args[0] == "fit" or options.ckpt_path is None:
+        return args
+    saved = read_checkpoint(options.ckpt_path)["lightning_pose"]
+    settings = {"model": {**saved["model"], "init_args": {**saved["model"]["init_args"]}}}
+    del settings["model"]["init_args"]["input_shape"]  # it follows from the data
+    if not options.config:
+        settings["data"] = saved["data"]
+    for file in options.config:
+        _check_architecture(options.ckpt_path, saved["model"]["class_path"], file)
+    configs = [word for text in (*options.config, json.dumps(settings)) for word in ("--config", text)]
+    return [args[0], *configs, *rest, "--ckpt_path", options.ckpt_path]
+
+
+def _check_architecture(checkpoint: str, saved: str, config: str) -> None:
+    """Refuse a config whose architecture is not the checkpoint's, before the two are mixed."""
+    try:
+        asked = yaml.safe_load(Path(config).read_text())["model"]["class_path"]
+    except (OSError, yaml.YAMLError, KeyError, TypeError):
+        return  # the parser says what is wrong with it
+    if asked.rpartition(".")[2] != saved.rpartition(".")[2]:
+        raise CheckpointError(
+            f"{checkpoint} holds a {saved.rpartition('.')[2]}, but {config} asks for {asked.rpartition('.')[2]}; "
+            "give the config it was trained with, or none"
+        )
+
+
+def main(argv: list[str]) -> int:
+    """Run one of LightningCLI's verbs; `argv` begins with it."""
+    # What Lightning tells of devices and restored files is no news to a user of this command line.
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    warnings.filterwarnings("ignore", message=".*LeafSpec.*")  # Lightning's own use of torch
+    try:
+        PoseCLI(argv)
+    except SIGTERMException:
+        return 143
+    except SystemExit as stop:
+        # Lightning turns Ctrl-C into exit code 1, once it has closed the run.
+        if stop.code == 1:
+            raise KeyboardInterrupt from stop
+        raise
+    return 0

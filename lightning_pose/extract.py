@@ -1,0 +1,18 @@
+"""The verb `extract`: fill the feature cache that a config needs, without training."""
+
+from __future__ import annotations
+
+from lightning_pose.cli import PoseCLI
+
+__all__ = ["main"]
+
+
+def main(argv: list[str]) -> int:
+    """Extract the features of every frame of the config's scene; what is cached already is kept."""
+    datamodule = PoseCLI(argv, run=False).datamodule
+    report = datamodule.fill()
+    print(
+        f"{report.total} frames: {report.computed} extracted, {report.cached} cached, {report.redone} redone, "
+        f"{report.seconds_per_image * 1e3:.1f} ms each\nin {datamodule.cache.folder}"
+    )
+    return 0

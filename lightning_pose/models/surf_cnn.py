@@ -1,0 +1,91 @@
+"""SurfCNN: a small convolutional network over the image that stacked descriptors make (thesis, chapter 2)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+from torch import Tensor, nn
+
+from lightning_pose.errors import ConfigError
+from lightning_pose.models.base import PoseModule
+
+__all__ = ["SurfCNN"]
+
+
+class SurfCNN(PoseModule):
+    """Convolutions over (N, D) descriptors, strongest first, seen as an image of one channel.
+
+    Table 2.1 of the thesis. It pools after every convolution, which would empty a 64-wide input twice over: here
+    the first three pools are 2x2 and the rest 1x2, along the descriptor, in ceil mode, which gives table 2.2's
+    parameter counts. Each convolution is followed by ReLU, batch normalisation and its pool.
+
+    Args:
+        channels: filters of each convolution.
+        kernels: side of each convolution's kernel; the first has stride 2.
+        units: width of the fully connected layer.
+        dropout: before the last linear layer.
+        **kwargs: what `PoseModule` takes.
+
+    Raises:
+        ConfigError: `channels` and `kernels` differ in length, or a kernel is even.
+    """
+
+    input_rank: ClassVar[int] = 2
+
+    def __init__(
+        self,
+        channels: list[int] = [64, 128, 256, 256, 256],  # noqa: B006  (never changed; shown as it is in --help)
+        kernels: list[int] = [7, 5, 5, 5, 3],  # noqa: B006
+        units: int = 2048,
+        dropout: float = 0.5,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(**kwargs)
+        if len(channels) != len(kernels) or not channels or any(kernel % 2 == 0 for kernel in kernels):
+            raise ConfigError(
+                f"channels {channels} and kernels {kernels} do not fit: give as many of each, kernels odd"
+            )
+        self.network = _ConvRegressor(self.input_shape, channels, kernels, units, dropout)
+
+    @property
+    def headline(self) -> str:
+        return f"N={self.input_shape[0]}"
+
+
+class _ConvRegressor(nn.Module):
+    def __init__(
+        self,
+        input_shape: tuple[int, ...],
+        channels: Sequence[int],
+        kernels: Sequence[int],
+        units: int,
+        dropout: float,
+    ) -> None:
+        super().__init__()
+        stages: list[nn.Module] = []
+        rows, columns = input_shape
+        width = 1
+        for i, (out, kernel) in enumerate(zip(channels, kernels, strict=True)):
+            stride = 2 if i == 0 else 1
+            pool = (2 if i < 3 else 1, 2)
+            stages += [
+                nn.Conv2d(width, out, kernel, stride, padding=kernel // 2),
+                nn.ReLU(),
+                nn.BatchNorm2d(out),
+                nn.MaxPool2d(pool, ceil_mode=True),
+            ]
+            rows, columns = (-(-size // (stride * p)) for size, p in zip((rows, columns), pool, strict=True))
+            width = out
+        self.convolutions = nn.Sequential(*stages)
+        self.head = nn.Sequential(
+            nn.Flatten(),
+            nn.Linear(width * rows * columns, units),
+            nn.ReLU(),
+            nn.Dropout(dropout),
+            nn.Linear(units, 7),
+        )
+
+    def forward(self, descriptors: Tensor) -> Tensor:
+        """(B, N, D) -> (B, 7)."""
+        return self.head(self.convolutions(descriptors.unsqueeze(1)))

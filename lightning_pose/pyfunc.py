@@ -1,0 +1,41 @@
+"""The localizer as an MLflow model: a table of image files in, a table of poses out.
+
+MLflow runs this file when it loads the model, which is safer than a pickle: the last line names the model.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+from mlflow.models import set_model
+from mlflow.pyfunc.model import PythonModel, PythonModelContext
+
+from lightning_pose.localize import Localizer
+
+__all__ = ["LocalizerModel"]
+
+COLUMNS = ["x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"]
+
+
+class LocalizerModel(PythonModel):
+    """What `mlflow.pyfunc.load_model` gives back for a run's `model`."""
+
+    def load_context(self, context: PythonModelContext) -> None:
+        self.localizer = Localizer.from_checkpoint(context.artifacts["checkpoint"])
+
+    def predict(self, context, model_input, params=None):  # no type hints: MLflow would validate by them
+        """Locate images.
+
+        Args:
+            context: MLflow's.
+            model_input: image files, as a list or as the first column of a table.
+            params: none are used.
+
+        Returns:
+            One row an image: camera centre in metres and camera-to-world quaternion.
+        """
+        images = model_input.iloc[:, 0] if isinstance(model_input, pd.DataFrame) else model_input
+        return pd.DataFrame(np.hstack(self.localizer(list(images))), columns=pd.Index(COLUMNS))
+
+
+set_model(LocalizerModel())

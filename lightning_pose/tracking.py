@@ -1,0 +1,175 @@
+"""Where runs are kept: an MLflow logger with the project's defaults, and the model that MLflow can load."""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lightning.fabric.utilities.rank_zero import rank_zero_only
+from lightning.pytorch.loggers import MLFlowLogger
+
+from lightning_pose.errors import CheckpointError
+
+if TYPE_CHECKING:
+    from mlflow import MlflowClient
+
+__all__ = ["MLflowLogger", "default_tracking_uri", "flatten", "last_run", "log_localizer"]
+
+REQUIREMENTS = ("torch", "lightning", "opencv-contrib-python-headless", "numpy", "scipy", "jsonargparse")
+"""What a logged model needs beside this package, which it carries along."""
+
+HOST_TAG, PROCESS_TAG = "process.host", "process.id"
+
+
+def default_tracking_uri(root: str | Path = "mlruns") -> str:
+    """`MLFLOW_TRACKING_URI`, or a database under `root`."""
+    return os.environ.get("MLFLOW_TRACKING_URI") or f"sqlite:///{Path(root) / 'mlflow.db'}"
+
+
+class MLflowLogger(MLFlowLogger):
+    """Lightning's MLflow logger, with a database by default and honest endings.
+
+    A run that a user or a signal stops ends as KILLED and one that breaks as FAILED. A run whose process was killed
+    outright is found by the next run on the same machine, and marked KILLED then.
+
+    Args:
+        experiment_name: MLflow experiment.
+        run_name: name of the run; derived from architecture, scene and main setting if not given.
+        tracking_uri: MLflow store; `MLFLOW_TRACKING_URI`, else `sqlite:///mlruns/mlflow.db`.
+        run_id: continue this run.
+        root: folder of the default database and its artifacts.
+    """
+
+    def __init__(
+        self,
+        experiment_name: str = "lightning_pose",
+        run_name: str | None = None,
+        tracking_uri: str | None = None,
+        run_id: str | None = None,
+        root: str = "mlruns",
+    ) -> None:
+        # alembic and mlflow announce each table of a new database on the terminal.
+        for noisy in ("alembic", "mlflow.store.db.utils", "mlflow.tracking.fluent"):
+            logging.getLogger(noisy).setLevel(logging.WARNING)
+        uri = tracking_uri or default_tracking_uri(root)
+        local = uri.startswith("sqlite:///")
+        if local:
+            Path(uri.removeprefix("sqlite:///")).parent.mkdir(parents=True, exist_ok=True)
+        super().__init__(
+            experiment_name=experiment_name,
+            run_name=run_name,
+            tracking_uri=uri,
+            run_id=run_id,
+            tags={HOST_TAG: socket.gethostname(), PROCESS_TAG: str(os.getpid())},
+            artifact_location=(Path(root) / "artifacts").resolve().as_uri() if local else None,
+        )
+        self.stopped_as = "FAILED"
+        self._closed_stale = False
+
+    @property
+    def client(self) -> MlflowClient:
+        """The MLflow client of the store, with the run created."""
+        client = self.experiment
+        if not self._closed_stale:
+            self._closed_stale = True
+            self._close_stale_runs(client)
+        return client
+
+    @property
+    def uri(self) -> str:
+        """The tracking store's address."""
+        return self._tracking_uri
+
+    def _close_stale_runs(self, client: MlflowClient) -> None:
+        """Mark runs of this machine whose process is gone: nothing could mark them when they died."""
+        query = f"attributes.status = 'RUNNING' and tags.`{HOST_TAG}` = '{socket.gethostname()}'"
+        for run in client.search_runs([str(self.experiment_id)], query):
+            if run.info.run_id != self.run_id and not _alive(int(run.data.tags[PROCESS_TAG])):
+                client.set_terminated(run.info.run_id, "KILLED")
+
+    @rank_zero_only
+    def log_hyperparams(self, params: Any) -> None:
+        """Log what the run does not have yet: MLflow refuses to change a parameter, and a resumed run may."""
+        known = self.client.get_run(str(self.run_id)).data.params
+        flat = flatten(params)
+        super().log_hyperparams({name: value for name, value in flat.items() if name not in known})
+
+    @rank_zero_only
+    def finalize(self, status: str = "success") -> None:
+        """End the run: FINISHED, or `stopped_as` where Lightning says that it failed."""
+        if self._initialized:
+            self.client.set_terminated(str(self.run_id), self.stopped_as if status == "failed" else "FINISHED")
+
+
+def _alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        pass
+    return True
+
+
+def flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings by dotted name; `init_args` is left out, so `model.units` and not `model.init_args.units`."""
+    flat: dict[str, Any] = {}
+    for key, value in config.items():
+        name = prefix if key == "init_args" else f"{prefix}.{key}" if prefix else str(key)
+        if isinstance(value, Mapping):
+            flat |= flatten(value, name)
+        else:
+            flat[name] = value
+    return flat
+
+
+def last_run(uri: str, experiment_name: str, checkpoints: Path, architecture: str, root: str) -> tuple[str, Path]:
+    """The newest run of an architecture on a scene that left a `last.ckpt`.
+
+    Args:
+        uri: MLflow store.
+        experiment_name: MLflow experiment.
+        checkpoints: folder of the runs' checkpoint folders.
+        architecture: class name.
+        root: the run's `data.root`, as its parameters have it.
+
+    Returns:
+        The run's id and its last checkpoint.
+
+    Raises:
+        CheckpointError: there is no such run.
+    """
+    from mlflow import MlflowClient
+
+    client = MlflowClient(uri)
+    experiment = client.get_experiment_by_name(experiment_name)
+    query = f"tags.architecture = '{architecture}' and params.`data.root` = '{root}'"
+    runs = client.search_runs([experiment.experiment_id], query) if experiment else []  # newest first
+    for run in runs:
+        checkpoint = checkpoints / run.info.run_id / "last.ckpt"
+        if checkpoint.is_file():
+            return run.info.run_id, checkpoint
+    raise CheckpointError(
+        f"no run of {architecture} on data.root={root} left a last.ckpt under {checkpoints}; "
+        "leave --ckpt_path out to start one"
+    )
+
+
+def log_localizer(logger: MLflowLogger, checkpoint: Path) -> None:
+    """Keep a localizer in the run as `model`, for `mlflow.pyfunc.load_model`."""
+    import mlflow
+
+    mlflow.set_tracking_uri(logger.uri)
+    with mlflow.start_run(run_id=str(logger.run_id)):
+        mlflow.pyfunc.log_model(
+            name="model",
+            python_model=str(Path(__file__).with_name("pyfunc.py")),
+            artifacts={"checkpoint": str(checkpoint)},
+            code_paths=[str(Path(__file__).parent)],
+            pip_requirements=[f"{name}=={version(name)}" for name in REQUIREMENTS],
+        )
