@@ -151,9 +151,10 @@ def _vlad_centres(descriptors: Tensor, seed: int) -> Tensor:
 
 
 def _vlad(descriptors: Tensor, centres: Tensor) -> Tensor:
-    """(N, K * D) VLAD vectors: per centre the sum of its descriptors' residuals (Jegou et al., CVPR 2010),
+    """(N, K * D) VLAD vectors: per centre the sum of its descriptors' residuals (Jegou et al., CVPR 2010).
 
-    each centre's part L2-normalised (Arandjelovic & Zisserman, CVPR 2013), then the whole.
+    Signed square roots tame bursts of one descriptor (Jegou et al., PAMI 2012); each centre's part is
+    L2-normalised (Arandjelovic & Zisserman, CVPR 2013), then the whole.
     """
     K, D = centres.shape
     vectors = []
@@ -162,6 +163,6 @@ def _vlad(descriptors: Tensor, centres: Tensor) -> Tensor:
         real = chunk[image, row]
         centre = torch.cdist(real, centres).argmin(dim=1)
         residuals = chunk.new_zeros(len(chunk) * K, D).index_add_(0, image * K + centre, real - centres[centre])
-        parts = F.normalize(residuals.view(len(chunk), K, D), dim=-1)
-        vectors.append(F.normalize(parts.flatten(1), dim=-1))
+        parts = F.normalize(residuals.sign() * residuals.abs().sqrt(), dim=-1)
+        vectors.append(F.normalize(parts.view(len(chunk), K * D), dim=-1))
     return torch.cat(vectors)

@@ -1,0 +1,242 @@
+"""The figures of a run: where it went, how often it is how wrong, and what its errors depend on.
+
+Each function returns a matplotlib `Figure` and touches neither pyplot, nor a display, nor the disk. The
+model is blue and the truth black throughout; baselines keep their own colour (Okabe & Ito's palette, told
+apart by the colour-blind) and dash.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, MultipleLocator, NullLocator, PercentFormatter
+from numpy.typing import ArrayLike
+
+__all__ = ["Errors", "cumulative_errors", "error_vs_distance", "trajectory"]
+
+Errors = tuple[ArrayLike, ArrayLike]
+"""Position errors (N,) in the scene's unit, and orientation errors (N,) in degrees."""
+
+MODEL, TRUTH, TRAINING = "#0072B2", "#1a1a1a", "#c4c4c4"
+BASELINES = {
+    "train_mean": ("#8c8c8c", (0, (1, 1.5))),
+    "retrieval_top1": ("#D55E00", (0, (5, 1.5))),
+    "retrieval_top5": ("#E69F00", (0, (3, 1.5))),
+    "oracle": ("#009E73", (0, (5, 1.5, 1, 1.5))),
+}
+OTHERS = [("#CC79A7", (0, (5, 1.5))), ("#56B4E9", (0, (3, 1.5))), ("#882255", (0, (1, 1)))]
+
+SMALLEST = 1e-4  # a tenth of a millimetre, or its like in degrees: zero has no place on a logarithmic axis
+
+STYLE: dict[Any, Any] = {
+    "font.family": "DejaVu Sans",
+    "font.size": 10,
+    "axes.titlesize": 12,
+    "axes.titlelocation": "left",
+    "axes.titleweight": "bold",
+    "axes.titlepad": 10,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": "#555555",
+    "axes.labelcolor": "#333333",
+    "axes.axisbelow": True,
+    "axes.grid": True,
+    "grid.color": "#e6e6e6",
+    "grid.linewidth": 0.8,
+    "xtick.color": "#555555",
+    "ytick.color": "#555555",
+    "legend.frameon": False,
+    "legend.fontsize": 9,
+    "figure.facecolor": "white",
+    "axes.facecolor": "white",
+}
+
+
+@matplotlib.rc_context(STYLE)
+def trajectory(
+    truth_m: ArrayLike,
+    prediction_m: ArrayLike,
+    sequences: Sequence[str] | None = None,
+    training_m: ArrayLike | None = None,
+    title: str = "Trajectory",
+    unit: str = "m",
+) -> Figure:
+    """True and predicted positions in the plane of the two axes along which the truth extends furthest.
+
+    A segment joins each prediction to its truth; a ring marks where each sequence begins. The view keeps
+    to where the truth and nearly all predictions are; the legend says how many lie outside.
+
+    Args:
+        truth_m: (N, 3), the frames of a sequence together and in order.
+        prediction_m: (N, 3); a row with NaN is not drawn, and counts as outside.
+        sequences: N names; one line is drawn for each. All frames are one sequence when None.
+        training_m: (M, 3) positions the model learned from, drawn faintly.
+        title: the heading.
+        unit: unit of the positions.
+    """
+    truth, prediction = np.asarray(truth_m, float), np.asarray(prediction_m, float)
+    names = np.asarray(["" for _ in truth] if sequences is None else sequences)
+    across, up = sorted(np.argsort(-np.ptp(truth, axis=0), kind="stable")[:2])
+    plane = [across, up]
+    training = np.asarray(np.empty((0, 3)) if training_m is None else training_m, float)[:, plane]
+    truth, prediction = truth[:, plane], prediction[:, plane]
+    low, high = _view(truth, prediction)
+    outside = int((~((prediction >= low) & (prediction <= high)).all(axis=1)).sum())
+
+    width, height = high - low
+    figure = Figure(figsize=(8, float(np.clip(7.1 * height / width, 2.5, 7)) + 1.3), dpi=150, layout="constrained")
+    axes = figure.add_subplot(title=title)
+    axes.plot(*training.T, ".", color=TRAINING, markersize=3, label="training frames")
+    segments = list(np.stack([truth, prediction], axis=1))
+    axes.add_collection(LineCollection(segments, colors=MODEL, linewidths=0.7, alpha=0.3))
+    for name in dict.fromkeys(names):
+        line = truth[names == name]
+        axes.plot(*line.T, color=TRUTH, linewidth=1.8, solid_capstyle="round", label="truth")
+        axes.plot(*line[0], "o", color="white", markeredgecolor=TRUTH, markeredgewidth=1.5, markersize=6, zorder=3)
+    label = f"prediction ({outside} outside)" if outside else "prediction"
+    size = 4 if len(truth) <= 500 else 2.5
+    axes.plot(*prediction.T, "o", color=MODEL, markeredgewidth=0, markersize=size, alpha=0.8, label=label)
+    axes.set(
+        xlim=(low[0], high[0]),
+        ylim=(low[1], high[1]),
+        aspect="equal",
+        xlabel=f"{'xyz'[across]} ({unit})",
+        ylabel=f"{'xyz'[up]} ({unit})",
+    )
+    step = np.diff(MaxNLocator(8).tick_values(0, max(width, height)))[0]
+    axes.xaxis.set_major_locator(MultipleLocator(step))
+    axes.yaxis.set_major_locator(MultipleLocator(step))
+    handles = {str(line.get_label()): line for line in axes.get_legend_handles_labels()[0]}
+    if not len(training):
+        del handles["training frames"]
+    figure.legend(handles=list(handles.values()), loc="outside lower center", ncols=3)
+    return figure
+
+
+@matplotlib.rc_context(STYLE)
+def cumulative_errors(
+    model: Errors,
+    baselines: Mapping[str, Errors],
+    name: str = "model",
+    title: str = "Share of frames within an error",
+    unit: str = "m",
+) -> Figure:
+    """How many frames are within each position error, and within each orientation error; higher is better.
+
+    The legends tell the medians, worst last. NaN counts as infinite, so a curve may end below 100 %.
+
+    Args:
+        model: the model's errors.
+        baselines: errors of what it is compared with, by name.
+        name: what to call the model.
+        title: the heading.
+        unit: unit of the position errors.
+    """
+    figure = Figure(figsize=(10, 5.2), dpi=150, layout="constrained")
+    figure.suptitle(title, x=0.015, ha="left", fontsize=12, fontweight="bold")
+    looks = {other: BASELINES.get(other, OTHERS[i % len(OTHERS)]) for i, other in enumerate(baselines)}
+    looks[name] = (MODEL, "-")
+    panels = figure.subplots(1, 2, sharey=True)
+    for axes, column, label, symbol in (
+        (panels[0], 0, f"position error ({unit})", f" {unit}"),
+        (panels[1], 1, "orientation error (°)", "°"),
+    ):
+        curves = {other: np.sort(_infinite(errors[column])) for other, errors in baselines.items()}
+        curves[name] = np.sort(_infinite(model[column]))
+        limits = _log_limits(np.concatenate(list(curves.values())))
+        for zorder, (curve, errors) in enumerate(curves.items(), start=2):
+            color, dash = looks[curve]
+            x = np.concatenate([[limits[0]], np.minimum(errors, 2 * limits[1])])
+            y = np.arange(len(x)) / len(errors)
+            style = {"color": color, "linestyle": dash, "linewidth": 2.6 if curve == name else 1.6}
+            median = f"{curve}  {np.median(errors):.3g}{symbol}"
+            axes.plot(x, y, drawstyle="steps-post", label=median, zorder=zorder, **style)
+        _log_axis(axes, "x", limits)
+        axes.set(ylim=(0, 1.02), xlabel=label)
+        axes.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
+        best_first = np.argsort([np.median(errors) for errors in curves.values()], kind="stable")
+        lines = [axes.get_lines()[i] for i in best_first]
+        axes.legend(handles=lines, title="median", loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2)
+    panels[0].set_ylabel("share of frames")
+    return figure
+
+
+@matplotlib.rc_context(STYLE)
+def error_vs_distance(
+    position_error_m: ArrayLike,
+    distance_m: ArrayLike,
+    title: str = "Error against distance from the training poses",
+    unit: str = "m",
+) -> Figure:
+    """Position error of each frame against its distance to the nearest training position.
+
+    On the diagonal the model is as far off as the best training pose: above it, a perfect retrieval would
+    do better; below it, the model interpolates between training poses.
+
+    Args:
+        position_error_m: (N,) the model's; a frame whose error is not finite is not drawn.
+        distance_m: (N,) the error of the `oracle` baseline.
+        title: the heading.
+        unit: unit of both.
+    """
+    error, distance = _infinite(position_error_m), np.asarray(distance_m, float)
+    finite = np.isfinite(error)
+    error, distance = np.maximum(error[finite], SMALLEST), np.maximum(distance[finite], SMALLEST)
+    limits = _log_limits(np.concatenate([error, distance]))
+    figure = Figure(figsize=(6, 6), dpi=150, layout="constrained")
+    axes = figure.add_subplot(title=title)
+    color, dash = BASELINES["oracle"]
+    axes.plot(limits, limits, color=color, linestyle=dash, linewidth=1.6, label="nearest training pose")
+    axes.plot(distance, error, "o", color=MODEL, markersize=4, alpha=0.35, markeredgewidth=0, label="test frame")
+    centres, medians = _binned_median(distance, error)
+    axes.plot(centres, medians, "o-", color=TRUTH, linewidth=1.8, markersize=5, label="median of a tenth")
+    for axis in ("x", "y"):
+        _log_axis(axes, axis, limits)
+    axes.set(
+        aspect="equal", xlabel=f"distance to the nearest training pose ({unit})", ylabel=f"position error ({unit})"
+    )
+    figure.legend(loc="outside lower center", ncols=3)
+    return figure
+
+
+def _view(truth: np.ndarray, prediction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(2,) lower and upper limits that hold all truth and the middle 96 % of predictions, with a margin."""
+    drawn = prediction[np.isfinite(prediction).all(axis=1)]
+    ends = np.quantile(drawn, [0.02, 0.98], axis=0) if len(drawn) else np.empty((0, 2))
+    held = np.concatenate([truth, ends])
+    low, high = held.min(axis=0), held.max(axis=0)
+    margin = 0.05 * max((high - low).max(), SMALLEST)
+    return low - margin, high + margin
+
+
+def _infinite(errors: ArrayLike) -> np.ndarray:
+    values = np.asarray(errors, float)
+    return np.where(np.isnan(values), np.inf, values)
+
+
+def _log_limits(errors: np.ndarray) -> tuple[float, float]:
+    """Limits that hold all finite errors but the smallest hundredth, which would stretch a logarithmic axis."""
+    finite = np.maximum(errors[np.isfinite(errors)], SMALLEST)
+    if not len(finite):
+        return 0.01, 1.0
+    return float(np.quantile(finite, 0.01)) * 0.9, float(finite.max()) * 1.1
+
+
+def _log_axis(axes: Axes, which: str, limits: tuple[float, float]) -> None:
+    axes.set(**{f"{which}scale": "log", f"{which}lim": limits})
+    axis = axes.xaxis if which == "x" else axes.yaxis
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5) if limits[1] < 1000 * limits[0] else (1,)))
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+
+
+def _binned_median(x: np.ndarray, y: np.ndarray, n_bins: int = 10) -> tuple[np.ndarray, np.ndarray]:
+    """Medians of x and of y over ten equally filled bins of x (fewer where there are fewer points)."""
+    bins = [part for part in np.array_split(np.argsort(x, kind="stable"), n_bins) if len(part)]
+    return np.array([np.median(x[part]) for part in bins]), np.array([np.median(y[part]) for part in bins])
