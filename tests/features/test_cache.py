@@ -34,7 +34,7 @@ from tests.features.helpers import ColorMeans
 print("ready", flush=True)
 sys.stdin.readline()
 images, root = map(Path, sys.argv[1:])
-print(FeatureCache(ColorMeans(seconds=0.02), root).fill(sorted(images.iterdir()), 2, progress=False))
+print(FeatureCache(ColorMeans(seconds=0.05), root).fill(sorted(images.iterdir()), 2, progress=False))
 """
 
 
@@ -196,6 +196,7 @@ def test_resumes_after_a_kill(tmp_path: Path) -> None:
     with start_filling(tmp_path / "images", root) as process:
         go(process)
         while len(records_in(root)) < 20:
+            assert process.poll() is None
             time.sleep(0.005)
         process.kill()
     saved = records_in(root)
