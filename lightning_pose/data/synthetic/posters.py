@@ -62,7 +62,7 @@ def _map(rng: np.random.Generator, h: int, w: int) -> np.ndarray:
     towns = rng.uniform((0, 0), (w, h), (int(rng.integers(25, 60)), 2)).astype(np.int32)
     seeds = np.full((h, w), 255, np.uint8)
     seeds[towns[:, 1], towns[:, 0]] = 0
-    _, labels = cv2.distanceTransformWithLabels(seeds, cv2.DIST_L2, 5)
+    labels = np.asarray(cv2.distanceTransformWithLabels(seeds, cv2.DIST_L2, 5)[1], np.intp)
     inks = np.array([color(rng, (0.5, 1.0), (0.15, 0.7)) for _ in range(labels.max() + 1)], np.float32)
     image = shaded(inks[labels], 1 + 0.05 * noise(rng, h, w))
     cv2.polylines(image, [towns[:9]], False, color(rng, (0.1, 0.4)), 3, cv2.LINE_AA)
@@ -86,7 +86,7 @@ def _painting(rng: np.random.Generator, h: int, w: int) -> np.ndarray:
 def _window(rng: np.random.Generator, h: int, w: int) -> np.ndarray:
     """Sky over a lit skyline, behind bars."""
     sky = np.linspace(0, 1, h, dtype=np.float32)[:, None, None]
-    zenith, horizon = np.float32(color(rng, (0.6, 0.9), (0.3, 0.6))), np.float32(color(rng, (0.8, 1.0)))
+    zenith, horizon = np.array(color(rng, (0.6, 0.9), (0.3, 0.6))), np.array(color(rng, (0.8, 1.0)))
     image = shaded((1 - sky) * zenith + sky * horizon, 1 + 0.08 * noise(rng, h, w, (90, 45, 20)))
     x = 0
     while x < w:

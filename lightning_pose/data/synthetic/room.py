@@ -172,14 +172,14 @@ def _lit(quad: Quad, size: np.ndarray, boxes: np.ndarray, lamps: np.ndarray) -> 
     normal = np.cross(quad.v, quad.u)
     normal /= np.linalg.norm(normal)
     points = quad.corner + s[..., None] * quad.u + t[..., None] * quad.v
-    light = 0.5 * _openness(points + 0.1 * normal, size, boxes)
+    light = 0.45 * _openness(points + 0.1 * normal, size, boxes)
     for lamp in lamps:
         for offset in 0.25 * np.array([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0)]):
             ray = lamp + offset - points
             distance = np.linalg.norm(ray, axis=-1)
             incidence = np.clip((ray @ normal) / distance, 0, 1)
             reaches = ~_blocked(points + 0.01 * normal, ray, boxes)
-            light += 0.16 * reaches * incidence / (0.35 + 0.1 * distance**2)
+            light += 0.145 * reaches * incidence / (0.35 + 0.1 * distance**2)
     shade = cv2.resize(light.astype(np.float32), (w, h), interpolation=cv2.INTER_LINEAR)
     return Quad(quad.corner, quad.u, quad.v, textures.shaded(quad.texture, shade))
 

@@ -99,12 +99,12 @@ def write(image: np.ndarray, text: str, corner: tuple[int, int], height: int, in
 
 def wallpaper(rng: np.random.Generator, h: int, w: int) -> np.ndarray:
     """Stripes carrying flowers, no two of which have the same petals, colour and place."""
-    base, stripe = color(rng, (0.55, 0.8), (0.1, 0.35)), color(rng, (0.5, 0.85), (0.1, 0.4))
+    base, stripe = color(rng, (0.55, 0.75), (0.03, 0.2)), color(rng, (0.5, 0.8), (0.05, 0.3))
     pitch = int(rng.integers(70, 110))
     edges = np.arange(w) + 4 * noise(rng, 1, w, (200, 60))[0]
     image = _canvas(h, w, base)
     image[:, (edges % pitch) < pitch * 0.45] = stripe
-    inks = [color(rng) for _ in range(5)]
+    inks = [color(rng, (0.3, 0.75), (0.1, 0.5)) for _ in range(5)]
     for y in range(pitch // 2, h, pitch):
         for x in range(pitch // 2, w, pitch):
             at = rng.normal((x, y), pitch * 0.1)

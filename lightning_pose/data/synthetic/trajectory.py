@@ -10,7 +10,16 @@ __all__ = ["Walk", "is_test", "make_walks"]
 
 FRAMES_PER_KNOT = 8
 STEP_M = 0.3
-"""How far the camera moves from knot to knot, and at most the point it looks at."""
+"""How far the camera moves from knot to knot, and the point that it looks at."""
+
+ASIDE_M, FAR_M = 0.15, 9.0
+"""How far from the training knots test walks keep, and a distance beyond any in the room: as far as possible."""
+
+START_M = 1.0
+"""How far from the middle of the volume test walks start at least: the mean training pose should be a bad guess."""
+
+WEIGHTS = np.array([1, 1, 0.7, 0.5, 0, 0.3])
+"""How much each coordinate of a knot counts in the distance between knots."""
 
 
 @dataclass(frozen=True)
@@ -55,50 +64,56 @@ def is_test(sequence: int) -> bool:
 def make_walks(seed: int, size_m: np.ndarray, lengths: list[int]) -> list[Walk]:
     """One walk per sequence, all in the same volume of about 3 x 2 x 0.6 m, looking at the far wall.
 
-    Training walks explore: each knot is the one of several candidates that is farthest, in position and
-    in the point looked at, from the knots of all earlier ones. Test walks wander at random.
+    Training walks explore: of several candidates, each next knot is the one farthest from all earlier knots,
+    in position and in the point looked at. Test walks pass among them, at `ASIDE_M` from the nearest.
     """
     rng = np.random.default_rng([seed, 1])
     near, far = -size_m[1] / 2 + 0.4, size_m[1] / 2
-    low = np.array([-1.5, near, 1.1, -1.3, far, 0.9])
-    high = np.array([1.5, near + 2, 1.7, 1.3, far, 1.5])
+    low = np.array([-1.5, near, 1.1, -0.8, far, 1.0])
+    high = np.array([1.5, near + 2, 1.7, 0.8, far, 1.7])
+    counts = [length // FRAMES_PER_KNOT + 5 for length in lengths]
+    knots: dict[int, np.ndarray] = {}
     seen = np.zeros((0, 6))
-    walks = []
-    for sequence, length in enumerate(lengths):
-        knots = _wander(rng, low, high, length // FRAMES_PER_KNOT + 5, seen, 1 if is_test(sequence) else 24)
-        if not is_test(sequence):
-            seen = np.concatenate([seen, knots])
-        roll = np.radians(rng.uniform(-5, 5, (len(knots), 1)))
-        tremor = 0.003 * rng.standard_normal((length // 2 + 5, 6))
-        walks.append(Walk(knots[:, :3], knots[:, 3:], roll, tremor, length))
-    return walks
+    for held_out in (False, True):
+        for i in range(len(lengths)):
+            if is_test(i) == held_out:
+                knots[i] = _wander(rng, low, high, counts[i], seen, ASIDE_M if held_out else FAR_M)
+                seen = seen if held_out else np.concatenate([seen, knots[i]])
+    return [_hand_held(rng, knots[i], length) for i, length in enumerate(lengths)]
+
+
+def _hand_held(rng: np.random.Generator, knots: np.ndarray, length: int) -> Walk:
+    roll = np.radians(rng.uniform(-5, 5, (len(knots), 1)))
+    tremor = 0.003 * rng.standard_normal((length // 2 + 5, 6))
+    return Walk(knots[:, :3], knots[:, 3:], roll, tremor, length)
 
 
 def _wander(
-    rng: np.random.Generator, low: np.ndarray, high: np.ndarray, count: int, seen: np.ndarray, candidates: int
+    rng: np.random.Generator, low: np.ndarray, high: np.ndarray, count: int, seen: np.ndarray, aside_m: float
 ) -> np.ndarray:
-    """(count, 6) knots of position and target within bounds, a step apart, turning gently."""
+    """(count, 6) knots of position and target within bounds, a step apart, turning gently.
 
-    def novel(options: np.ndarray) -> int:
-        if not len(seen):
-            return 0
-        weights = np.array([1, 1, 0.7, 0.6, 0, 0.3])
-        return int(np.linalg.norm((options[:, None] - seen) * weights, axis=-1).min(1).argmax())
+    Each is the candidate whose distance from the nearest knot seen is closest to `aside_m`.
+    """
 
-    starts = rng.uniform(low, high, (candidates, 6))
-    knots = [starts[novel(starts)]]
+    def choose(options: np.ndarray, seen: np.ndarray) -> np.ndarray:
+        gaps = np.linalg.norm((options[:, None] - seen) * WEIGHTS, axis=-1).min(1, initial=FAR_M)
+        return options[np.abs(gaps - aside_m).argmin()]
+
+    starts = rng.uniform(low, high, (48, 6))
+    if aside_m < FAR_M:
+        starts = starts[np.linalg.norm((starts - (low + high) / 2)[:, :2], axis=1) > START_M]
+    knots = [choose(starts, seen)]
     heading = rng.standard_normal(6)
     for _ in range(count - 1):
-        turns = heading + 0.8 * rng.standard_normal((candidates, 6)) * (1, 1, 0.4, 1, 0, 0.5)
+        turns = heading + 1.3 * rng.standard_normal((24, 6)) * (1, 1, 0.4, 1, 0, 0.5)
         for part in (slice(0, 3), slice(3, 6)):
             turns[:, part] *= STEP_M / np.linalg.norm(turns[:, part], axis=1, keepdims=True)
         # A step that would leave the volume turns back, axis by axis.
         ahead = knots[-1] + turns
         turns = np.where((ahead < low) | (ahead > high), -turns, turns)
-        options = np.clip(knots[-1] + turns, low, high)
-        best = novel(options)
-        heading = turns[best] / STEP_M
-        knots.append(options[best])
+        knots.append(choose(knots[-1] + turns, np.vstack([seen, *knots[:-2]])))
+        heading = (knots[-1] - knots[-2]) / STEP_M
     return np.array(knots)
 
 
