@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import re
 import warnings
 from pathlib import Path
 from typing import Any, NoReturn
@@ -32,13 +33,22 @@ class PoseParser(LightningArgumentParser):
     """A parser that raises ConfigError, so that a wrong setting ends in one line, like any other mistake."""
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
-        raise ConfigError(_one_line(message)) from ex
+        told = isinstance(ex, ConfigError)  # a subcommand's parser has put it into words already
+        raise ConfigError(str(ex) if told else _one_line(message)) from ex
+
+
+NOISE = re.compile(
+    r"Does not validate against any of the Union subtypes|Subtypes: .*|Errors:|Expected a <class 'NoneType'>"
+    r"|Given value type: .*|Given value: (NestedArg|Namespace|\{).*"
+)
 
 
 def _one_line(message: str) -> str:
-    """jsonargparse explains itself over many lines; its first ones say which setting and what is wrong with it."""
-    lines = [line.strip(" -") for line in message.splitlines() if line.strip()]
-    return " ".join(lines)
+    """jsonargparse's many lines without what it says of its own types: which setting, and what is wrong with it."""
+    lines = [NOISE.sub("", line).strip(" -") for line in message.splitlines()]
+    text = " ".join(line for line in lines if line)
+    text = re.sub(r"<class '([^']+)'>", r"\1", re.sub(r'Parser key "([^"]+)":', r"\1:", text))
+    return f"{text}; `python -m lightning_pose fit --help` explains every setting"
 
 
 class PoseCLI(LightningCLI):
@@ -83,6 +93,15 @@ class PoseCLI(LightningCLI):
 
     def _parse_ckpt_path(self) -> None:
         """Nothing: `_with_saved_config` has taken the settings out of the checkpoint already."""
+
+    def instantiate_classes(self) -> None:
+        try:
+            super().instantiate_classes()
+        except ValueError as error:
+            # jsonargparse wraps what a constructor refuses; the constructor's own words are among its lines.
+            if str(error).startswith("Does not validate"):
+                raise ConfigError(_one_line(str(error))) from error
+            raise
 
     def before_instantiate_classes(self) -> None:
         if self.subcommand in ("validate", "predict"):

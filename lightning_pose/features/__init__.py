@@ -1,0 +1,21 @@
+"""Images -> features: SURF of our own, other descriptors through OpenCV, and the cache that keeps them all.
+
+`base` says how to add an extractor.
+"""
+
+from lightning_pose.features.base import FeatureExtractor, LocalExtractor
+from lightning_pose.features.cache import FeatureCache, FillReport
+from lightning_pose.features.classical import BRIEF, FREAK, ORB, SIFT
+from lightning_pose.features.surf import SURF
+
+__all__ = [
+    "BRIEF",
+    "FREAK",
+    "ORB",
+    "SIFT",
+    "SURF",
+    "FeatureCache",
+    "FeatureExtractor",
+    "FillReport",
+    "LocalExtractor",
+]

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import ClassVar, Literal
 
 import numpy as np
 
 from lightning_pose.errors import ConfigError
+from lightning_pose.images import read_gray, read_rgb
 
 __all__ = ["MIN_STORED_FEATURES", "FeatureExtractor", "LocalExtractor", "Record"]
 
@@ -51,6 +53,14 @@ class FeatureExtractor(ABC):
     @abstractmethod
     def feature_shape(self) -> tuple[int, ...]:
         """Shape of one image's features as the networks read them."""
+
+    def read(self, path: str | Path) -> np.ndarray:
+        """One image file as `extract` wants it.
+
+        Raises:
+            ImageError: the file is missing or cannot be read.
+        """
+        return read_gray(path) if self.color == "gray" else read_rgb(path)
 
     @abstractmethod
     def extract(self, images: Sequence[np.ndarray]) -> list[Record]:
