@@ -37,10 +37,12 @@ def describe(integral: Tensor, image: Tensor, xy: Tensor, size: Tensor, angle: T
         patch = _upright_patch(integral, image, xy, window)
     else:
         patch = _rotated_patch(integral, image, xy, window, torch.deg2rad(angle))
-    smooth, change = _filters(integral.device)
-    dx, dy = smooth @ patch @ change.T, change @ patch @ smooth.T
-    responses = torch.stack([dx, dy, dx.abs(), dy.abs()], -1)
-    return normalize(responses.unflatten(2, (4, 5)).unflatten(1, (4, 5)).sum((2, 4)).flatten(1))
+    filters = _filters(integral.device)
+    smooth, change = (filters @ patch.flatten(1)).view(2, CELLS - 1, CELLS, -1)
+    dx, dy = filters[CELLS - 1 :] @ smooth, filters[: CELLS - 1] @ change
+    responses = torch.stack([dx, dy, dx.abs(), dy.abs()], 2)  # (across, along, 4, K)
+    fields = responses.unflatten(1, (4, 5)).sum(2).unflatten(0, (4, 5)).sum(1)
+    return normalize(fields.flatten(0, 2).T)
 
 
 def orientations(integral: Tensor, image: Tensor, xy: Tensor, size: Tensor) -> Tensor:
@@ -51,92 +53,92 @@ def orientations(integral: Tensor, image: Tensor, xy: Tensor, size: Tensor) -> T
     disc, weight = _disc(integral.device)
     scale = size * (1.2 / 9)
     half = torch.round(2 * scale)  # half the wavelet's side
-    corner = torch.round(xy[:, None] + disc * scale[:, None, None] - (half[:, None, None] - 0.5))  # (K, 113, 2)
-    limit = torch.tensor([integral.shape[2], integral.shape[1]], device=xy.device) - 2 * half[:, None, None]
-    inside = ((corner >= 0) & (corner < limit)).all(2)
-    corner, side = (corner * inside[..., None]).flatten(0, 1), half.repeat_interleave(len(disc))
-    steps = side[:, None] * torch.arange(3, device=xy.device)
-    sums = _sums(integral, image.repeat_interleave(len(disc)), corner[:, 1:] + steps, corner[:, :1] + steps)
-    bands = sums[:, 2] - sums[:, 0], sums[:, :, 2] - sums[:, :, 0]
-    dx, dy = (b[:, 0] + b[:, 2] - 2 * b[:, 1] for b in bands)
-    gradient = torch.stack([dx, dy], 1).view(len(xy), -1, 2) * (weight * inside)[..., None]
+    corner = torch.round(xy.T[:, None] + disc[..., None] * scale - (half - 0.5))  # (2, 113, K)
+    limit = torch.tensor([integral.shape[2], integral.shape[1]], device=xy.device).view(2, 1, 1) - 2 * half
+    inside = ((corner >= 0) & (corner < limit)).all(0)
+    x, y = (corner * inside)[:, None] + half * torch.arange(3, device=xy.device).view(3, 1, 1)
+    sums = _sums(integral, image.repeat(len(weight)), y.flatten(1), x.flatten(1)).unflatten(2, inside.shape)
+    dx = _second_difference(sums[2] - sums[0]) * weight[:, None] * inside
+    dy = _second_difference(sums[:, 2] - sums[:, 0]) * weight[:, None] * inside
 
-    degree = torch.round(torch.rad2deg(torch.atan2(gradient[..., 1], gradient[..., 0]))).long() % 360
-    histogram = gradient.new_zeros((len(xy), 360, 2)).scatter_add_(1, degree[..., None].expand(-1, -1, 2), gradient)
-    around = torch.cat([histogram[:, -29:], histogram, histogram[:, :29]], 1).cumsum(1)
-    around = pad(around, (0, 0, 1, 0))
+    degree = torch.round(torch.rad2deg(torch.atan2(dy, dx))).long() % 360
+    histogram = dx.new_zeros((2, 360, len(xy))).scatter_add_(1, degree.expand(2, -1, -1), torch.stack([dx, dy]))
+    around = torch.cat([histogram[:, -29:], histogram, histogram[:, :29]], 1)
+    around = pad(around.cumsum(1), (0, 0, 1, 0))
     sectors = (around[:, 59:] - around[:, :-59])[:, ::5]  # every 5 degrees, 29 to each side
-    best = sectors.square().sum(2).argmax(1)
-    x, y = sectors[torch.arange(len(xy), device=xy.device), best].unbind(1)
+    best = sectors.square().sum(0).argmax(0)
+    x, y = sectors.gather(1, best.expand(2, 1, -1)).squeeze(1)
     return torch.rad2deg(torch.atan2(y, x)) % 360
 
 
+def _second_difference(a: Tensor) -> Tensor:
+    return a[0] - 2 * a[1] + a[2]
+
+
 def _upright_patch(integral: Tensor, image: Tensor, xy: Tensor, window: Tensor) -> Tensor:
-    """(K, 21, 21) grey sums of cells: axis 1 to the right, axis 2 upwards, as OpenCV places whole pixels."""
-    half = (window[:, None] - 1) / 2
-    edge = window[:, None] / CELLS * torch.arange(CELLS + 1, device=xy.device)
-    right = torch.round(xy[:, :1] - half) + edge
-    up = torch.round(xy[:, 1:] + half) + 1 - edge
-    sums = _sums(integral, image, up, right)
-    columns = sums[:, :-1] - sums[:, 1:]
-    return (columns[..., 1:] - columns[..., :-1]).transpose(1, 2)
+    """(21, 21, K) grey sums of cells, to the right and upwards, as OpenCV places whole pixels."""
+    x, y = xy.unbind(1)
+    half = (window - 1) / 2
+    edge = torch.arange(CELLS + 1, device=xy.device)[:, None] * (window / CELLS)
+    sums = _sums(integral, image, torch.round(y + half) + 1 - edge, torch.round(x - half) + edge)
+    columns = sums[:-1] - sums[1:]
+    return (columns[:, 1:] - columns[:, :-1]).transpose(0, 1)
 
 
 def _rotated_patch(integral: Tensor, image: Tensor, xy: Tensor, window: Tensor, angle: Tensor) -> Tensor:
-    """(K, 21, 21) grey sums around the centres of rotated cells.
+    """(21, 21, K) grey sums around the centres of rotated cells, across and along the angle.
 
     The cells themselves stay parallel to the image, so that integral images serve.
     """
     cell = window / CELLS
-    along = (torch.arange(CELLS, device=xy.device) - CELLS // 2) * cell[:, None]
-    cos, sin = torch.cos(angle)[:, None, None], torch.sin(angle)[:, None, None]
-    u, v = along[:, :, None], along[:, None, :]
-    centre = xy[:, None, None] + 0.5 + torch.stack([v * cos - u * sin, v * sin + u * cos], -1)  # (K, 21, 21, 2)
-    half = cell[:, None, None, None] / 2
-    box = torch.stack([centre - half, centre + half], -1).flatten(0, 2)
-    sums = _sums(integral, image.repeat_interleave(CELLS * CELLS), box[:, 1], box[:, 0])
-    return (sums[:, 1, 1] - sums[:, 0, 1] - sums[:, 1, 0] + sums[:, 0, 0]).view(-1, CELLS, CELLS)
+    along = (torch.arange(CELLS, device=xy.device) - CELLS // 2)[:, None] * cell
+    u, v, cos, sin = along[:, None], along, torch.cos(angle), torch.sin(angle)
+    edges = torch.stack([-cell, cell])[:, None, None] / 2 + 0.5
+    x = edges + (xy[:, 0] + v * cos - u * sin)
+    y = edges + (xy[:, 1] + v * sin + u * cos)
+    sums = _sums(integral, image.repeat(CELLS * CELLS), y.flatten(1), x.flatten(1))
+    return (sums[1, 1] - sums[0, 1] - sums[1, 0] + sums[0, 0]).view(CELLS, CELLS, -1)
 
 
 def _sums(integral: Tensor, image: Tensor, y: Tensor, x: Tensor) -> Tensor:
-    """(K, R, C) integrals at R fractional rows and C columns of each of K places, up to terms of one axis.
+    """(R, C, K) integrals at R fractional rows and C columns of each of K places, up to terms of one axis.
 
     What depends on the row alone or on the column alone drops out of every box sum; without it the
     numbers are small enough for float32. Outside the image the border pixels are repeated.
     """
+    plane, line, _ = integral.stride()
     rows, down = _lattice(y, integral.shape[1])
     cols, across = _lattice(x, integral.shape[2])
-    index = (image[:, None] * integral.stride(0) + rows * integral.shape[2])[:, :, None] + cols[:, None]
+    index = (rows * line + (image * plane).int())[:, None] + cols
     sums = integral.view(-1).index_select(0, index.view(-1)).view(index.shape)
-    sums = (sums - sums[:, :1]).sub_(sums[:, :, :1] - sums[:, :1, :1]).float()
-    n, m = y.shape[1], x.shape[1]
-    sums = torch.lerp(sums[:, :n], sums[:, n:], down[:, :, None])
-    return torch.lerp(sums[..., :m], sums[..., m:], across[:, None])
+    sums = (sums - sums[:1]).sub_(sums[:, :1] - sums[:1, :1]).float()
+    sums = torch.lerp(sums[: len(y)], sums[len(y) :], down[:, None])
+    return torch.lerp(sums[:, : len(x)], sums[:, len(x) :], across)
 
 
 def _lattice(position: Tensor, length: int) -> tuple[Tensor, Tensor]:
-    """Lattice neighbours (K, 2 * E) below and above each position, and the fraction (K, E) between them.
+    """Lattice neighbours (2 * E, K) int32 below and above each position; fraction (E, K) between them.
 
     Beyond the ends the neighbours stay and the fraction leaves 0..1: linear extrapolation.
     """
     below = position.floor().clamp_(0, length - 2)
-    cell = below.long()
-    return torch.cat([cell, cell + 1], 1), position - below
+    cell = below.int()
+    return torch.cat([cell, cell + 1]), position - below
 
 
 @lru_cache(maxsize=4)
-def _filters(device: torch.device) -> tuple[Tensor, Tensor]:
-    """(20, 21) Gaussian-weighted sums of two neighbouring cells, and changes between them."""
+def _filters(device: torch.device) -> Tensor:
+    """(40, 21) Gaussian-weighted: 20 sums of two neighbouring cells, then the 20 changes between them."""
     cells = torch.eye(CELLS)
     i = torch.arange(CELLS - 1) - (CELLS - 2) / 2
     weight = torch.exp(-(i**2) / (2 * 3.3**2))[:, None]
-    return (weight * (cells[1:] + cells[:-1])).to(device), (weight * (cells[1:] - cells[:-1])).to(device)
+    return torch.cat([weight * (cells[1:] + cells[:-1]), weight * (cells[1:] - cells[:-1])]).to(device)
 
 
 @lru_cache(maxsize=4)
 def _disc(device: torch.device) -> tuple[Tensor, Tensor]:
-    """The 113 lattice points (x, y) within a radius of 6, and their Gaussian weights."""
-    i = torch.arange(-6, 7)
-    points = torch.cartesian_prod(i, i)
-    points = points[points.square().sum(1) <= 36].float()
-    return points.to(device), torch.exp(-points.square().sum(1) / (2 * 2.5**2)).to(device)
+    """(2, 113) lattice points x, y within a radius of 6, and their (113,) Gaussian weights."""
+    points = torch.cartesian_prod(*[torch.arange(-6, 7)] * 2).T
+    square = points.square().sum(0)
+    points, square = points[:, square <= 36], square[square <= 36]
+    return points.to(device), torch.exp(-square / (2 * 2.5**2)).to(device)

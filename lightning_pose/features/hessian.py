@@ -1,26 +1,30 @@
 """SURF's detector: integral images and scale-space maxima of the box-filter Hessian's determinant.
 
 Bay, Ess, Tuytelaars, Van Gool: "Speeded-Up Robust Features", 2008, section 3. Filter sizes, sampling and
-the maximum search are laid out as OpenCV does it: 4 octaves of 3 searched layers, octave o sampled every
-2**o pixels. A pixel's centre is at integer coordinates.
+the search for maxima are laid out as OpenCV does it: 4 octaves of 3 searched layers, octave o sampled
+every 2**o pixels. A pixel's centre has integer coordinates.
 """
 
 from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import NamedTuple
+from itertools import product
+from typing import NamedTuple, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 __all__ = ["Detections", "detect", "integral_image"]
 
 OCTAVES = 4
 LAYERS = 5
 """Layers of an octave: three are searched, the outer two only bound the search."""
-REFINE = 2
-"""Candidates looked at in one go, as a multiple of the features wanted; about two thirds survive."""
+
+
+Layers = TypeVar("Layers", int, Tensor)
 
 
 class Detections(NamedTuple):
@@ -56,214 +60,217 @@ def detect(integral: Tensor, n: int, threshold: float) -> Detections:
     Args:
         integral: (B, H + 1, W + 1) int32 integral images.
         n: rows to return per image.
-        threshold: smallest determinant that counts, on OpenCV's hessianThreshold scale.
+        threshold: determinants up to this one do not count; OpenCV's hessianThreshold.
     """
     octaves = [_candidates(integral, octave, threshold) for octave in range(OCTAVES)]
-    candidates = [torch.cat(column) for column in zip(*octaves, strict=True)]
-    order = torch.argsort(candidates[-1], descending=True, stable=True)
-    order = order[torch.argsort(candidates[0][order], stable=True)]
-    image, layer, row, col, response = (column[order] for column in candidates)
-    rank = _rank(image, integral.shape[0])
-    found: list[tuple[Tensor, ...]] = []
-    batch = integral.shape[0]
-    count = torch.zeros(batch, dtype=torch.int64, device=integral.device)
-    for first in range(0, _longest(image, batch), REFINE * n):
-        pick = ((rank >= first) & (rank < first + REFINE * n)).nonzero().squeeze(1)
-        ok, xy, size = _refine(integral, image[pick], layer[pick], row[pick], col[pick])
-        found.append((image[pick][ok], xy[ok], size[ok], response[pick][ok]))
-        count += torch.bincount(found[-1][0], minlength=batch)
-        if bool((count >= n).all()):
+    image, layer, row, col, score = (torch.cat(column) for column in zip(*octaves, strict=True))
+    batch, total = integral.shape[0], len(image)
+    scores = score.new_zeros((batch, total))
+    scores[image, torch.arange(total, device=image.device)] = score
+    scores, ranking = scores.sort(dim=1, descending=True, stable=True)
+
+    # Refining costs more than ranking, and about two thirds survive it: from the top down, until n have.
+    found = []
+    enough = max(2 * n, 600)
+    for first in range(0, total, enough):
+        response, pick = scores[:, first : first + enough], ranking[:, first : first + enough]
+        keep, x, y, size = _refine(integral, layer[pick], row[pick], col[pick])
+        keep &= response > 0
+        found.append(torch.stack([keep, x, y, size, response], -1).where(keep[..., None], 0))
+        if sum(part[..., 0].sum(1) for part in found).min() >= n:
             break
-    return _pack(found, batch, n, integral.device)
-
-
-def _longest(image: Tensor, batch: int) -> int:
-    return int(torch.bincount(image, minlength=batch).max()) if len(image) else 0
-
-
-def _rank(image: Tensor, batch: int) -> Tensor:
-    """Position of each entry among those of its image; `image` is sorted."""
-    count = torch.bincount(image, minlength=batch)
-    return torch.arange(len(image), device=image.device) - (count.cumsum(0) - count)[image]
-
-
-def _pack(found: list[tuple[Tensor, ...]], batch: int, n: int, device: torch.device) -> Detections:
-    xy = torch.zeros((batch, n, 2), device=device)
-    size, response = torch.zeros((2, batch, n), device=device)
-    count = torch.zeros(batch, dtype=torch.int64, device=device)
-    if found:
-        image, *columns = (torch.cat(column) for column in zip(*found, strict=True))
-        order = torch.argsort(image, stable=True)
-        image = image[order]
-        rank = _rank(image, batch)
-        keep = rank < n
-        where = (image[keep], rank[keep])
-        for target, column in zip((xy, size, response), columns, strict=True):
-            target[where] = column[order][keep]
-        count = torch.bincount(image, minlength=batch).clamp(max=n)
-    return Detections(xy, size, response, count)
+    features = torch.cat([*found, score.new_zeros((batch, n, 5))], 1)
+    strongest = features[..., 0].argsort(dim=1, descending=True, stable=True)[:, :n]
+    features = features.gather(1, strongest[..., None].expand(-1, -1, 5))
+    return Detections(features[..., 1:3], features[..., 3], features[..., 4], features[..., 0].sum(1).long())
 
 
 def _size(octave: int, layer: int) -> int:
-    """Side of the box filter, pixels."""
+    """Side of a layer's box filter, pixels."""
     return (9 + 6 * layer) << octave
 
 
-def _margin(octave: int, layer: int) -> int:
-    """Half the filter's side, in samples of the octave."""
-    return _size(octave, layer) // 2 >> octave
+def _margin(layer: Layers) -> Layers:
+    """Half a filter's side, in samples of its octave."""
+    return 4 + 3 * layer
 
 
-def _edges(size: int) -> tuple[int, int, int, int, int, int]:
-    """The paper's 9x9 filters, scaled: lobe; near and far edge of a long side; first and second
-    diagonal lobe; their distance."""
-    first, second = round(size / 9), round(size * 5 / 9)
-    return size // 3, round(size * 2 / 9), round(size * 7 / 9), first, second, second - first
+def _edges(size: int) -> tuple[int, int, int, int, int]:
+    """The paper's 9 x 9 filters, scaled.
+
+    Returns:
+        width of a lobe; near and far edge of a lobe's long side; near edges of the diagonal lobes.
+    """
+    near, far, first, second = (round(size * ninths / 9) for ninths in (2, 7, 1, 5))
+    return size // 3, near, far, first, second
 
 
 def _candidates(integral: Tensor, octave: int, threshold: float) -> tuple[Tensor, ...]:
-    """Samples of the searched layers that no neighbour in these layers exceeds.
+    """Samples of an octave's searched layers that no neighbour in these layers exceeds.
 
     Returns:
-        image, layer (octave * LAYERS + layer), row, column (samples) and determinant, one entry each.
+        image, layer (octave * LAYERS + layer), row and column (samples), determinant: one entry each.
     """
     batch, height, width = integral.shape
     rows, cols = (height - 1) >> octave, (width - 1) >> octave
-    low = _margin(octave, 2)
-    shape = (batch, max(rows - 2 * low, 0), max(cols - 2 * low, 0))
-    dets = integral.new_zeros((3, *shape), dtype=torch.float32)
-    for layer in (1, 2, 3):
-        inset = _margin(octave, max(layer, 2)) - low
-        inner = (shape[1] - 2 * inset, shape[2] - 2 * inset)
-        if min(inner) > 0:
-            start = (low + inset - _margin(octave, layer)) << octave
-            dets[layer - 1][:, inset : inset + inner[0], inset : inset + inner[1]] = _determinant(
-                integral, _size(octave, layer), 1 << octave, start, inner
-            )
-    found = []
-    for layer in (1, 2, 3):
-        inset = _margin(octave, layer + 1) + 1 - low
-        if min(shape[1:]) <= 2 * inset:
-            continue
-        near = dets[max(layer - 2, 0) : layer + 1].amax(0)[:, inset - 1 : shape[1] - inset + 1]
-        near = torch.maximum(torch.maximum(near[:, :-2], near[:, 1:-1]), near[:, 2:])
-        near = near[:, :, inset - 1 : shape[2] - inset + 1]
-        near = torch.maximum(torch.maximum(near[:, :, :-2], near[:, :, 1:-1]), near[:, :, 2:])
-        det = dets[layer - 1][:, inset : shape[1] - inset, inset : shape[2] - inset]
-        image, row, col = ((det >= near) & (det > threshold)).nonzero().unbind(1)
-        offset = low + inset
-        found.append(
-            (
-                image,
-                torch.full_like(row, octave * LAYERS + layer),
-                row + offset,
-                col + offset,
-                det[image, row, col],
-            )
-        )
-    empty = integral.new_zeros(0, dtype=torch.int64)
-    found.append((empty, empty, empty, empty, empty.float()))
-    return tuple(torch.cat(column) for column in zip(*found, strict=True))
+    low = _margin(2)  # the first sample that is a neighbour of a possible maximum
+    if min(rows, cols) <= 2 * low + 2:
+        nothing = integral.new_zeros(0, dtype=torch.int64)
+        return nothing, nothing, nothing, nothing, nothing.float()
+    height, width = rows - 2 * low, cols - 2 * low
+    det = [torch.zeros((batch, height, width), device=integral.device) for _ in range(3)]
+    for layer, plane in enumerate(det, 1):
+        inset = max(_margin(layer) - low, 0)
+        inner = plane[:, inset : height - inset, inset : width - inset]
+        if inner.numel():
+            start = (low + inset - _margin(layer)) << octave
+            _determinant(integral, _size(octave, layer), 1 << octave, start, inner)
+
+    # Comparing in place, in float32, is several times faster than making masks.
+    lower, upper = torch.maximum(det[0], det[1]), torch.maximum(det[1], det[2])
+    highest = [_around(plane) for plane in (lower, torch.maximum(lower, det[2]), upper)]
+    least = float(np.nextafter(np.float32(threshold), np.float32(np.inf)))
+    peaks = [h.clamp_(min=least).le_(plane[:, 1:-1, 1:-1]) for h, plane in zip(highest, det, strict=True)]
+    bits = peaks[0].add_(peaks[1], alpha=2).add_(peaks[2], alpha=4).flatten()
+    at = _nonzero(bits)
+    layer, entry = (bits[at].int() & torch.tensor([[1], [2], [4]], device=at.device)).nonzero().unbind(1)
+    line, col = _divmod(at, width - 2)
+    image, row = _divmod(line, height - 2)
+    score = torch.stack([plane[image, row + 1, col + 1] for plane in det])[layer, entry]
+    image, row, col = image[entry], row[entry] + 1, col[entry] + 1
+    layer, row, col = layer + 1, row + low, col + low
+    border = 8 + 3 * layer  # one sample more than the margin of the layer above
+    inside = (row >= border) & (row < rows - border) & (col >= border) & (col < cols - border)
+    inside = inside.nonzero().squeeze(1)
+    return tuple(column[inside] for column in (image, layer + octave * LAYERS, row, col, score))
 
 
-def _determinant(integral: Tensor, size: int, step: int, start: int, shape: tuple[int, int]) -> Tensor:
-    """(B, *shape) determinants of one filter size; the first filter's corner is at (start, start)."""
-    lobe, near, far, first, _, apart = _edges(size)
-    n, m = shape
-    t = lobe // step
+def _around(plane: Tensor) -> Tensor:
+    """(B, h, w) -> (B, h - 2, w - 2): the largest of each 3 x 3 neighbourhood."""
+    high = torch.maximum(plane[:, :-2], plane[:, 2:])
+    torch.maximum(high, plane[:, 1:-1], out=high)
+    wide = torch.maximum(high[..., :-2], high[..., 2:])
+    return torch.maximum(wide, high[..., 1:-1], out=wide)
 
-    def corners(y: int, x: int, rows: int, cols: int, stride: int = step) -> Tensor:
-        y, x = y + start, x + start
-        return integral[:, y : y + (rows - 1) * stride + 1 : stride, x : x + (cols - 1) * stride + 1 : stride]
+
+def _divmod(a: Tensor, b: int) -> tuple[Tensor, Tensor]:
+    quotient = torch.div(a, b, rounding_mode="floor")
+    return quotient, a - quotient * b
+
+
+def _nonzero(values: Tensor) -> Tensor:
+    """Where the (n,) values are not zero. Searching eight bytes at a time, as these are few."""
+    flags = pad(values.bool(), (0, -len(values) % 8))
+    words = flags.view(torch.int64).nonzero().squeeze(1)
+    word, byte = flags.view(-1, 8)[words].nonzero().unbind(1)
+    return words[word] * 8 + byte
+
+
+def _determinant(integral: Tensor, size: int, step: int, start: int, out: Tensor) -> None:
+    """Write one layer's determinants to `out` (B, n, m); the first filter's corner is at (start, start).
+
+    Every sum of boxes is built from shifted differences of whole planes, each shared by many boxes.
+    """
+    lobe, near, far, first, second = _edges(size)
+    (_, n, m), t = out.shape, lobe // step
+
+    def corners(y: int, x: int, rows: int, cols: int, step: int = step) -> Tensor:
+        plane, line, _ = integral.stride()
+        offset = (start + y) * line + start + x
+        return integral.as_strided((len(out), rows, cols), (plane, step * line, step), offset)
 
     band = corners(far, 0, n, m + 3 * t) - corners(near, 0, n, m + 3 * t)
-    dxx = (band[..., 3 * t :] - band[..., :m]).sub_(band[..., 2 * t : 2 * t + m] - band[..., t : t + m], alpha=3)
+    dxx = _lobes(*(band.narrow(2, k * t, m) for k in range(4)))
     band = corners(0, far, n + 3 * t, m) - corners(0, near, n + 3 * t, m)
-    dyy = (band[:, 3 * t :] - band[:, :n]).sub_(band[:, 2 * t : 2 * t + n] - band[:, t : t + n], alpha=3)
+    dyy = _lobes(*(band.narrow(1, k * t, n) for k in range(4)))
 
-    grid = math.gcd(step, apart)  # the four lobes of dxy do not lie on the sampling grid of every layer
+    apart = second - first
+    grid = math.gcd(step, apart)  # the lobes of dxy are not always whole samples apart
     u, c, t = step // grid, apart // grid, lobe // grid
     rows, cols = (n - 1) * u + 1, (m - 1) * u + 1
     high, wide = rows + c, cols + c + t
     band = corners(first + lobe, first, high, wide, grid) - corners(first, first, high, wide, grid)
     band = band[:, :rows:u] - band[:, c::u]
     band = band[..., t:] - band[..., :-t]
-    dxy = band[..., :cols:u] - band[..., c::u]
+    dxy = (band[..., :cols:u] - band[..., c::u]).float()
 
-    area, lobe_area = lobe * (far - near), lobe * lobe
-    det = (dxx * (1 / area)).mul_(dyy * (1 / area))
-    dxy = dxy * (0.9 / lobe_area)
-    return det.addcmul_(dxy, dxy, value=-1)
+    area = lobe * (far - near)
+    dxx.mul_(dyy).addcmul_(dxy, dxy, value=-((0.9 * area / lobe**2) ** 2))
+    torch.mul(dxx, area**-2, out=out)
+
+
+def _lobes(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Tensor:
+    """Float sum over three adjoining lobes, weighted 1, -2, 1, from the integrals at their four edges."""
+    middle = c - b
+    return torch.add(d, middle, alpha=-3, out=middle).sub_(a).float()
 
 
 @lru_cache(maxsize=4)
-def _filters(device: torch.device) -> tuple[Tensor, ...]:
-    """Of every layer (octave * LAYERS + layer): the 32 corners (y, x) of its filters, their int32 weights,
-    (dxx, dyy, dxy) normalisers, and (sampling step, margin, size)."""
-    points, normalisers, grids = [], [], []
-    for octave in range(OCTAVES):
-        for layer in range(LAYERS):
-            size = _size(octave, layer)
-            lobe, near, far, first, second, _ = _edges(size)
-            ends = ((near, -1), (far, 1))
-            lobes = tuple((lobe * k, w) for k, w in enumerate((-1, 3, -3, 1)))
-            cross = ((first, -1), (first + lobe, 1), (second, 1), (second + lobe, -1))
-            pairs = [*((y, x) for y in ends for x in lobes), *((y, x) for y in lobes for x in ends)]
-            pairs += [(y, x) for y in cross for x in cross]
-            points.append([(y, x, wy * wx) for (y, wy), (x, wx) in pairs])
-            normalisers.append((1 / (lobe * (far - near)), 1 / (lobe * (far - near)), 0.9 / lobe**2))
-            grids.append((1 << octave, _margin(octave, layer), size))
-    table = torch.tensor(points, dtype=torch.int32, device=device)
-    return (
-        table[..., :2].long(),
-        table[..., 2],
-        torch.tensor(normalisers, device=device),
-        torch.tensor(grids, device=device),
-    )
-
-
-def _refine(integral: Tensor, image: Tensor, layer: Tensor, row: Tensor, col: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Keep strict maxima of their 3x3x3 neighbourhood and fit a quadric to it.
+def _boxes(device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """The filters of all layers, as eight boxes: two of dxx (whole, middle lobe), two of dyy, four of dxy.
 
     Returns:
-        ok (K,) bool; xy (K, 2) and size (K,) float32, sub-pixel and sub-scale.
+        (2, 4, 8, 20) int32: y and x of the four corners of the boxes; (3, 20) float32 areas of dxx, dyy
+        and dxy; (20,) sizes.
     """
-    stride = integral.shape[2]
-    points, weights, normalisers, grids = _filters(integral.device)
-    layers = layer[:, None] + torch.arange(-1, 2, device=layer.device)  # (K, 3)
-    step, margin = grids[layers, 0], grids[layers, 1]
-    near = torch.arange(-1, 2, device=layer.device)
-    y = (row[:, None, None] - margin[:, :, None] + near) * step[:, :, None]  # (K, 3, 3)
-    x = (col[:, None, None] - margin[:, :, None] + near) * step[:, :, None]
-    corner = points[layers][:, :, None, None]  # (K, 3, 1, 1, 32, 2)
-    index = (y[:, :, :, None, None] + corner[..., 0]) * stride + x[:, :, None, :, None] + corner[..., 1]
-    index += (image * integral.stride(0)).view(-1, 1, 1, 1, 1)
-    values = integral.view(-1)[index] * weights[layers][:, :, None, None]
-    d = (
-        torch.stack([part.sum(-1, dtype=torch.int32) for part in values.split((8, 8, 16), dim=-1)], dim=-1)
-        * normalisers[layers][:, :, None, None]
-    )
-    det = d[..., 0] * d[..., 1] - d[..., 2].square()  # (K, 3, 3, 3): scale, y, x
-    offset, fits = _fit(det)
-    others = det.flatten(1)[:, [i for i in range(27) if i != 13]]
-    ok = (det[:, 1, 1, 1] > others.amax(1)) & fits
-    step, margin, size = grids[layer].unbind(1)
-    base = torch.stack([col, row], 1) - margin[:, None]
-    xy = (base * step[:, None] + (size[:, None] - 1) / 2) + offset[:, :2] * step[:, None]
-    return ok, xy, torch.round(size + offset[:, 2] * 6 * step)
+    boxes, areas, sizes = [], [], []
+    for octave, layer in product(range(OCTAVES), range(LAYERS)):
+        size = _size(octave, layer)
+        lobe, near, far, first, second = _edges(size)
+        long, whole, middle = (near, far), (0, size), (lobe, 2 * lobe)
+        diagonal = [(k, k + lobe) for k in (first, second)]
+        spans = [(long, whole), (long, middle), (whole, long), (middle, long), *product(diagonal, diagonal)]
+        boxes.append([[*product(ys, xs)] for ys, xs in spans])
+        areas.append((lobe * (far - near), lobe * (far - near), lobe**2 / 0.9))
+        sizes.append(size)
+    corners = torch.tensor(boxes, dtype=torch.int32).permute(3, 2, 1, 0).contiguous()
+    return corners.to(device), torch.tensor(areas, device=device).T, torch.tensor(sizes, device=device)
 
 
-def _fit(det: Tensor) -> tuple[Tensor, Tensor]:
-    """Peak of the quadric through (K, 3, 3, 3) samples: (K, 3) offsets (x, y, scale); is it inside."""
-    centre = det[:, 1, 1, 1]
-    minus, plus = (torch.stack([det[:, 1, 1, e], det[:, 1, e, 1], det[:, e, 1, 1]], 1) for e in (0, 2))
+def _refine(integral: Tensor, layer: Tensor, row: Tensor, col: Tensor) -> tuple[Tensor, ...]:
+    """Check candidates (B, K) against all 26 neighbours, and move them to the top of the quadric they form.
+
+    Returns:
+        keep (B, K) bool: strict maxima whose quadric has its top within a sample; x, y (sub-pixel) and
+        size (sub-scale, rounded to pixels).
+    """
+    plane, line, _ = integral.stride()
+    corners, areas, sizes = _boxes(integral.device)
+    image = torch.arange(len(layer), device=layer.device).repeat_interleave(layer.shape[1])
+    shape, (layer, row, col) = layer.shape, (c.flatten() for c in (layer, row, col))
+    near = torch.arange(-1, 2, device=layer.device)[:, None]
+    step = 1 << torch.div(layer, LAYERS, rounding_mode="floor")
+    layers = layer + near  # (3, K)
+    margin = _margin(layers % LAYERS)[:, None]
+    y, x = (row + near - margin) * step, (col + near - margin) * step  # (3, 3, K): scale, place
+    base = ((y * line + image * plane)[:, :, None] + x[:, None]).int()
+    offset = (corners[0] * line + corners[1]).flatten(0, 1).index_select(1, layers.flatten())
+    index = base[:, :, :, None] + offset.view(32, 3, -1).transpose(0, 1)[:, None, None]  # (3, 3, 3, 32, K)
+    sums = integral.view(-1).index_select(0, index.view(-1)).view(3, 3, 3, 4, 8, -1)
+    box = (sums[..., 3, :, :] - sums[..., 2, :, :]).sub_(sums[..., 1, :, :]).add_(sums[..., 0, :, :])
+    dxx, dyy = (box[..., i, :].sub(box[..., i + 1, :], alpha=3) / areas[0, layers][:, None, None] for i in (0, 2))
+    dxy = (box[..., 4, :] - box[..., 5, :] - box[..., 6, :] + box[..., 7, :]) / areas[2, layers][:, None, None]
+    det = dxx * dyy - dxy * dxy  # (3, 3, 3, K): scale, row, column
+
+    offset, inside = _top(det)
+    strict = (det.view(27, -1) < det[1, 1, 1]).sum(0) == 26
+    size = sizes[layer]
+    corner = (size - 1) / 2
+    x = x[1, 1] + corner + offset[0] * step
+    y = y[1, 1] + corner + offset[1] * step
+    size = torch.round(size + offset[2] * 6 * step)
+    return tuple(column.view(shape) for column in (strict & inside, x, y, size))
+
+
+def _top(d: Tensor) -> tuple[Tensor, Tensor]:
+    """Top of the quadric through (3, 3, 3, K) samples: (3, K) offsets in x, y, scale; (K,) within a sample?"""
+    plus, minus = (torch.stack([d[1, 1, e], d[1, e, 1], d[e, 1, 1]]) for e in (2, 0))
     gradient = (plus - minus) / 2
-    dxx, dyy, dss = (plus - 2 * centre[:, None] + minus).unbind(1)
-    dxy = (det[:, 1, 2, 2] - det[:, 1, 2, 0] - det[:, 1, 0, 2] + det[:, 1, 0, 0]) / 4
-    dxs = (det[:, 2, 1, 2] - det[:, 2, 1, 0] - det[:, 0, 1, 2] + det[:, 0, 1, 0]) / 4
-    dys = (det[:, 2, 2, 1] - det[:, 2, 0, 1] - det[:, 0, 2, 1] + det[:, 0, 0, 1]) / 4
-    columns = [torch.stack(c, 1) for c in ((dxx, dxy, dxs), (dxy, dyy, dys), (dxs, dys, dss))]
-    adjugate = [torch.linalg.cross(columns[i - 2], columns[i - 1]) for i in range(3)]
-    determinant = (columns[0] * adjugate[0]).sum(1)
-    offset = -torch.stack([(a * gradient).sum(1) for a in adjugate], 1) / determinant[:, None]
-    return offset, (offset.abs() <= 1).all(1)
+    dxx, dyy, dss = plus - 2 * d[1, 1, 1] + minus
+    dxy = (d[1, 2, 2] - d[1, 2, 0] - d[1, 0, 2] + d[1, 0, 0]) / 4
+    dxs = (d[2, 1, 2] - d[2, 1, 0] - d[0, 1, 2] + d[0, 1, 0]) / 4
+    dys = (d[2, 2, 1] - d[2, 0, 1] - d[0, 2, 1] + d[0, 0, 1]) / 4
+    a, b, c = (torch.stack(column) for column in ((dxx, dxy, dxs), (dxy, dyy, dys), (dxs, dys, dss)))
+    adjugate = torch.stack([b.cross(c, dim=0), c.cross(a, dim=0), a.cross(b, dim=0)])
+    offset = -(adjugate * gradient).sum(1) / (a * adjugate[0]).sum(0)
+    return offset, (offset.abs() <= 1).all(0)

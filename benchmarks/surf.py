@@ -1,0 +1,78 @@
+"""Time of SURF against OpenCV's SIFT: the same frames, one thread, interleaved rounds in one run.
+
+    python benchmarks/surf.py --images DIR [--n_features 300] [--rounds 5]
+
+Both detect and describe the N strongest features. Without `--images` the frames are made: blurred noise
+of many scales, 640 x 480. The ratio is the median over frames and rounds of SURF's time over SIFT's.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from pathlib import Path
+from statistics import median
+
+import cv2
+import numpy as np
+import torch
+
+from lightning_pose.features.surf import SURF
+
+SUFFIXES = {".jpg", ".jpeg", ".png"}
+
+
+def read_frames(folder: Path, count: int) -> list[np.ndarray]:
+    """`count` grayscale frames, spread evenly over the images in a folder and below it."""
+    paths = sorted(p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES and "depth" not in p.name)
+    if not paths:
+        raise SystemExit(f"no {', '.join(sorted(SUFFIXES))} images below {folder}; give a folder that has some")
+    frames = [cv2.imread(str(p), cv2.IMREAD_GRAYSCALE) for p in paths[:: max(len(paths) // count, 1)][:count]]
+    return [frame for frame in frames if frame is not None]
+
+
+def make_frames(count: int) -> list[np.ndarray]:
+    """Textured 640 x 480 frames: noise blurred at many scales."""
+    random = np.random.default_rng(0)
+    frames = []
+    for _ in range(count):
+        octaves = [cv2.resize(random.normal(size=(480 >> k, 640 >> k)), (640, 480)) * 2**k for k in range(6)]
+        frames.append(cv2.normalize(np.sum(octaves, axis=0), np.zeros(0), 0, 255, cv2.NORM_MINMAX, cv2.CV_8U))
+    return frames
+
+
+def milliseconds(work: Callable[[], object]) -> float:
+    start = time.perf_counter()
+    work()
+    return (time.perf_counter() - start) * 1e3
+
+
+def main() -> None:
+    """Print the median times per frame and their ratio."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--images", type=Path, help="folder of images (default: made frames)")
+    parser.add_argument("--frames", type=int, default=20, help="how many of the images to use")
+    parser.add_argument("--n_features", type=int, default=300)
+    parser.add_argument("--rounds", type=int, default=5)
+    args = parser.parse_args()
+
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    frames = read_frames(args.images, args.frames) if args.images else make_frames(args.frames)
+    sift, surf = cv2.SIFT_create(args.n_features), SURF(args.n_features)
+    tensors = [torch.from_numpy(frame)[None] for frame in frames]
+    sift.detectAndCompute(frames[0], None), surf(tensors[0])
+    pairs = [
+        (milliseconds(lambda f=f: sift.detectAndCompute(f, None)), milliseconds(lambda t=t: surf(t)))
+        for _ in range(args.rounds)
+        for f, t in zip(frames, tensors, strict=True)
+    ]
+    sift_ms, surf_ms = (median(column) for column in zip(*pairs, strict=True))
+    print(f"{len(frames)} frames of {frames[0].shape[1]} x {frames[0].shape[0]}, {args.rounds} rounds, N = {args.n_features}")
+    print(f"SIFT {sift_ms:.1f} ms, SURF {surf_ms:.1f} ms a frame")
+    print(f"ratio {median(b / a for a, b in pairs):.3f}")
+
+
+if __name__ == "__main__":
+    main()
