@@ -150,7 +150,7 @@ def _write_frame(renderer: Renderer, folder: Path, walk: Walk, seed: list[int], 
     image = renderer.render(np.array([walk.pose(moment) for moment in moments]))
     image = _expose(image, np.random.default_rng([*seed, frame]), np.random.default_rng(seed), frame)
     stem = folder / f"frame-{frame:06d}"
-    ok, png = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    ok, png = cv2.imencode(".png", image)
     if not ok:
         raise RuntimeError(f"OpenCV could not encode frame {frame}")
     Path(f"{stem}.color.png").write_bytes(png.tobytes())

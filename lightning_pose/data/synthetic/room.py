@@ -173,13 +173,12 @@ def _lit(quad: Quad, size: np.ndarray, boxes: np.ndarray, lamps: np.ndarray) -> 
     normal /= np.linalg.norm(normal)
     points = quad.corner + s[..., None] * quad.u + t[..., None] * quad.v
     light = 0.45 * _openness(points + 0.1 * normal, size, boxes)
-    for lamp in lamps:
-        for offset in 0.25 * np.array([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0)]):
-            ray = lamp + offset - points
-            distance = np.linalg.norm(ray, axis=-1)
-            incidence = np.clip((ray @ normal) / distance, 0, 1)
-            reaches = ~_blocked(points + 0.01 * normal, ray, boxes)
-            light += 0.145 * reaches * incidence / (0.35 + 0.1 * distance**2)
+    softness = 0.25 * np.array([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0)])
+    rays = (lamps[:, None] + softness).reshape(-1, 3) - points[..., None, :]
+    distance = np.linalg.norm(rays, axis=-1)
+    incidence = np.clip((rays @ normal) / distance, 0, 1)
+    reaches = ~_blocked(points[..., None, :] + 0.01 * normal, rays, boxes)
+    light += (0.145 * reaches * incidence / (0.35 + 0.1 * distance**2)).sum(-1)
     shade = cv2.resize(light.astype(np.float32), (w, h), interpolation=cv2.INTER_LINEAR)
     return Quad(quad.corner, quad.u, quad.v, textures.shaded(quad.texture, shade))
 
@@ -196,7 +195,7 @@ def _openness(points: np.ndarray, size: np.ndarray, boxes: np.ndarray) -> np.nda
 
 def _blocked(points: np.ndarray, rays: np.ndarray, boxes: np.ndarray) -> np.ndarray:
     """Whether the segment from each point along its ray hits a box (slab test)."""
-    blocked = np.zeros(points.shape[:-1], bool)
+    blocked = np.zeros(rays.shape[:-1], bool)
     inverse = 1 / np.where(np.abs(rays) < 1e-9, 1e-9, rays)
     for low, high in boxes:
         first, second = (low - points) * inverse, (high - points) * inverse
