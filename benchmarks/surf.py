@@ -69,7 +69,9 @@ def main() -> None:
         for f, t in zip(frames, tensors, strict=True)
     ]
     sift_ms, surf_ms = (median(column) for column in zip(*pairs, strict=True))
-    print(f"{len(frames)} frames of {frames[0].shape[1]} x {frames[0].shape[0]}, {args.rounds} rounds, N = {args.n_features}")
+    print(
+        f"{len(frames)} frames of {frames[0].shape[1]} x {frames[0].shape[0]}, {args.rounds} rounds, N = {args.n_features}"
+    )
     print(f"SIFT {sift_ms:.1f} ms, SURF {surf_ms:.1f} ms a frame")
     print(f"ratio {median(b / a for a, b in pairs):.3f}")
 

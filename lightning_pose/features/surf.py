@@ -18,7 +18,8 @@ from torch import Tensor
 from lightning_pose.errors import ConfigError, ImageError
 from lightning_pose.features.base import LocalExtractor, Record
 from lightning_pose.features.haar import UPRIGHT_ANGLE, describe, orientations
-from lightning_pose.features.hessian import detect, integral_image
+from lightning_pose.features.hessian import integral_image
+from lightning_pose.features.maxima import detect
 
 __all__ = ["SURF", "SurfFeatures"]
 
