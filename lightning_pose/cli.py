@@ -12,6 +12,7 @@ from typing import Any, NoReturn
 
 import torch
 import yaml
+from jsonargparse import DefaultHelpFormatter
 from lightning import LightningDataModule, Trainer
 from lightning.pytorch.callbacks import Timer
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
@@ -29,14 +30,21 @@ from lightning_pose.tum import write_sequences
 __all__ = ["PoseCLI", "main"]
 
 
+class _HelpFormatter(argparse.RawDescriptionHelpFormatter, DefaultHelpFormatter):
+    """Keeps the examples as they are written."""
+
+
 class PoseParser(LightningArgumentParser):
-    """A parser that raises ConfigError, so that a wrong setting ends in one line, like any other mistake."""
+    """A parser that raises ConfigError, so that a wrong setting ends in one line like any other mistake."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, formatter_class=_HelpFormatter, **kwargs)
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
-        told = isinstance(ex, ConfigError)  # a subcommand's parser has put it into words already
-        raise ConfigError(str(ex) if told else _one_line(message)) from ex
+        raise ConfigError(_one_line(message)) from ex
 
 
+REMEDY = "`python -m lightning_pose fit --help` explains every setting"
 NOISE = re.compile(
     r"Does not validate against any of the Union subtypes|Subtypes: .*|Errors:|Expected a <class 'NoneType'>"
     r"|Given value type: .*|Given value: (NestedArg|Namespace|\{).*"
@@ -48,7 +56,48 @@ def _one_line(message: str) -> str:
     lines = [NOISE.sub("", line).strip(" -") for line in message.splitlines()]
     text = " ".join(line for line in lines if line)
     text = re.sub(r"<class '([^']+)'>", r"\1", re.sub(r'Parser key "([^"]+)":', r"\1:", text))
-    return f"{text}; `python -m lightning_pose fit --help` explains every setting"
+    # A nested parser's message comes through here twice.
+    return text if text.endswith(REMEDY) else f"{text}; {REMEDY}"
+
+
+HELP = {
+    "fit": """Train a localizer, test its best checkpoint, and print it beside its baselines.
+
+  the built-in room      fit --config configs/quickstart.yaml
+  your data              fit --config configs/surf_lstm.yaml --data.root DIR
+  change any setting     ... --model.units 200 --data.extractor.n_features 100 --trainer.max_epochs 20
+  another seed           ... --seed_everything 1
+  go on after a stop     ... --ckpt_path last
+  see every run          mlflow ui --backend-store-uri sqlite:///mlruns/mlflow.db
+
+Settings of an architecture, a data module, a feature extractor:
+
+  fit --model.help lightning_pose.models.SurfLSTM
+  fit --data.help lightning_pose.data.datamodules.ImageDataModule
+  fit --data lightning_pose.data.datamodules.ImageDataModule --data.extractor.help lightning_pose.features.SURF""",
+    "validate": """Measure a checkpoint on the validation frames. The checkpoint knows its architecture and its data.
+
+  validate --ckpt_path mlruns/checkpoints/RUN_ID/best.ckpt""",
+    "test": """Measure a checkpoint on the test frames, beside its baselines, in a run of its own.
+The checkpoint knows its architecture and its data; both can be overridden.
+
+  test --ckpt_path mlruns/checkpoints/RUN_ID/best.ckpt
+  test --ckpt_path mlruns/checkpoints/RUN_ID/best.ckpt --data.root OTHER_COPY""",
+    "predict": """Write a checkpoint's poses of the test frames, one TUM file a sequence.
+
+  predict --ckpt_path mlruns/checkpoints/RUN_ID/best.ckpt""",
+    "extract": """Fill the feature cache that a config needs, on all cores; what is cached already is kept.
+
+  extract --config configs/surf_lstm.yaml --data.root DIR""",
+}
+
+
+def _help(verb: str) -> dict[str, Any]:
+    return {
+        "prog": f"python -m lightning_pose {verb}",
+        "usage": f"python -m lightning_pose {verb} --config FILE [--SETTING VALUE ...]",
+        "description": HELP[verb],
+    }
 
 
 class PoseCLI(LightningCLI):
@@ -79,6 +128,7 @@ class PoseCLI(LightningCLI):
             auto_configure_optimizers=False,
             load_from_checkpoint_support=False,  # checkpoints carry their own plain settings
             parser_class=PoseParser,
+            parser_kwargs={verb: _help(verb) for verb in self.subcommands()} if run else _help("extract"),
             args=_with_saved_config(args) if run else args,
             run=run,
         )

@@ -13,7 +13,7 @@ from torch.utils.data import DataLoader
 from lightning_pose.data.batches import PoseBatch, PoseDataset, batch_loader
 from lightning_pose.data.formats import load_scene
 from lightning_pose.data.scene import Scene
-from lightning_pose.data.synthetic import render_room
+from lightning_pose.data.synthetic import RENDERER_VERSION, render_room
 from lightning_pose.errors import ConfigError, DataError
 from lightning_pose.features import FeatureCache, FeatureExtractor
 from lightning_pose.features.cache import FillReport
@@ -88,7 +88,7 @@ class ImageDataModule(LightningDataModule):
         return self._scene
 
     def _room(self) -> Path:
-        folder = cache_folder("rooms") / f"room-{self.room_seed}-{self.room_frames}"
+        folder = cache_folder("rooms") / f"room-{self.room_seed}-{self.room_frames}-v{RENDERER_VERSION}"
         return render_room(folder, self.room_seed, self.room_frames)
 
     def prepare_data(self) -> None:
