@@ -1,0 +1,224 @@
+"""A scene, an extractor and a command line so small that a training run takes a second."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from unittest import mock
+
+import cv2
+import numpy as np
+import yaml
+from lightning import Trainer
+from lightning.pytorch.callbacks import Callback
+from mlflow import MlflowClient
+from mlflow.entities import Run
+
+from lightning_pose.__main__ import main
+from lightning_pose.features.base import FeatureExtractor, Record
+
+__all__ = ["REPOSITORY", "FailAt", "InterruptAt", "Thumbnails", "Trained", "Workplace", "write_scene"]
+
+REPOSITORY = Path(__file__).parents[1]
+
+
+class Thumbnails(FeatureExtractor):
+    """The image, shrunk to a few gray pixels, as (rows, columns) features.
+
+    Args:
+        rows: of the thumbnail.
+        columns: of the thumbnail.
+    """
+
+    color = "gray"
+    primary = "thumbnail"
+
+    def __init__(self, rows: int = 6, columns: int = 8) -> None:
+        self.rows, self.columns = rows, columns
+
+    @property
+    def settings(self) -> Mapping[str, str | int | float | bool | None]:
+        return {"rows": self.rows, "columns": self.columns}
+
+    @property
+    def feature_shape(self) -> tuple[int, ...]:
+        return self.rows, self.columns
+
+    def extract(self, images: Sequence[np.ndarray]) -> list[Record]:
+        size = self.columns, self.rows
+        shrunk = [cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in images]
+        return [{"thumbnail": thumbnail.astype(np.float32) / 127.5 - 1} for thumbnail in shrunk]
+
+
+class FailAt(Callback):
+    """Breaks in the middle of an epoch, as a mistake in a program would."""
+
+    def __init__(self, epoch: int) -> None:
+        self.epoch = epoch
+
+    def on_train_batch_end(self, trainer: Trainer, *args: object, **kwargs: object) -> None:
+        if trainer.current_epoch == self.epoch:
+            self.stop()
+
+    def stop(self) -> None:
+        raise RuntimeError("a mistake in the program")
+
+
+class InterruptAt(FailAt):
+    """Presses Ctrl-C in the middle of an epoch."""
+
+    def stop(self) -> None:
+        raise KeyboardInterrupt
+
+
+def write_scene(root: Path, train: Sequence[int] = (12, 12), test: int = 10, size: tuple[int, int] = (64, 48)) -> Path:
+    """A scene in 7-Scenes layout: windows of one smooth wallpaper, whose places are the positions.
+
+    Args:
+        root: folder to write.
+        train: number of frames in each training sequence.
+        test: number of frames in the one test sequence.
+        size: width and height of the images.
+    """
+    rng = np.random.default_rng(0)
+    wallpaper = cv2.resize(rng.uniform(0, 255, (24, 32)), None, fx=10, fy=10, interpolation=cv2.INTER_CUBIC)
+    wallpaper = np.clip(wallpaper + rng.normal(0, 3, wallpaper.shape), 0, 255).astype(np.uint8)
+    root.mkdir(parents=True)
+    lengths = [*train, test]
+    for file, numbers in (("TrainSplit.txt", range(len(train))), ("TestSplit.txt", [len(train)])):
+        (root / file).write_text("".join(f"sequence{number + 1}\n" for number in numbers))
+    for number, length in enumerate(lengths):
+        folder = root / f"seq-{number + 1:02d}"
+        folder.mkdir()
+        for i in range(length):
+            along = i / max(length - 1, 1)
+            x = int(along * (wallpaper.shape[1] - size[0]))
+            y = int((number + 0.5) / len(lengths) * (wallpaper.shape[0] - size[1]))
+            stem = folder / f"frame-{i:06d}"
+            cv2.imwrite(f"{stem}.color.png", wallpaper[y : y + size[1], x : x + size[0]])
+            np.savetxt(f"{stem}.pose.txt", _pose(x / 100, y / 100, turn=along), fmt="%.9f")
+    return root
+
+
+def _pose(x: float, y: float, turn: float) -> np.ndarray:
+    """(4, 4) camera-to-world, turned by `turn` radians about the vertical axis."""
+    cos, sin = math.cos(turn), math.sin(turn)
+    return np.array([[cos, 0, sin, x], [0, 1, 0, y], [-sin, 0, cos, 0], [0, 0, 0, 1]])
+
+
+@dataclass(frozen=True)
+class Workplace:
+    """A folder to run the command line in: a scene, a config, and an MLflow store.
+
+    Attributes:
+        folder: the current folder of its runs.
+        scene: a scene of `write_scene`.
+        config: trains a tiny SurfLSTM on it for two epochs.
+    """
+
+    folder: Path
+    scene: Path
+    config: Path
+
+    @classmethod
+    def make(cls, folder: Path, scene: Path, store: Path) -> Workplace:
+        """Set up a folder, with a copy of an empty MLflow store, because making one takes seconds."""
+        (folder / "mlruns").mkdir(parents=True)
+        shutil.copy(store, folder / "mlruns" / "mlflow.db")
+        config = {
+            "trainer": {"max_epochs": 2, "accelerator": "cpu", "devices": 1},
+            "model": {
+                "class_path": "lightning_pose.models.SurfLSTM",
+                "init_args": {"units": 8, "layers": 1, "learning_rate": 0.01, "schedule": "constant"},
+            },
+            "data": {
+                "class_path": "lightning_pose.data.datamodules.ImageDataModule",
+                "init_args": {
+                    "extractor": {"class_path": "tests.helpers.Thumbnails"},
+                    "root": str(scene),
+                    "batch_size": 8,
+                },
+            },
+        }
+        (folder / "tiny.yaml").write_text(yaml.safe_dump(config))
+        return cls(folder, scene, folder / "tiny.yaml")
+
+    @property
+    def client(self) -> MlflowClient:
+        # An absolute path: MLflow keeps a connection for each address, and tests change the current folder.
+        return MlflowClient(self.uri)
+
+    @property
+    def uri(self) -> str:
+        return f"sqlite:///{self.folder / 'mlruns' / 'mlflow.db'}"
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """What a process needs that runs here."""
+        return {"MLFLOW_TRACKING_URI": self.uri, "PYTHONPATH": str(REPOSITORY), "OMP_NUM_THREADS": "1"}
+
+    def run(self, verb: str, *args: object) -> int:
+        """One command, with this workplace's config; the exit code."""
+        return self.command(verb, "--config", self.config, *args)
+
+    def command(self, *args: object) -> int:
+        """One command, as given; the exit code."""
+        with contextlib.chdir(self.folder), mock.patch.dict(os.environ, self.environment):
+            return main([str(arg) for arg in args])
+
+    def start(self, *args: object) -> subprocess.Popen[str]:
+        """One command through the real entry point, in a process of its own."""
+        return subprocess.Popen(
+            [sys.executable, "-m", "lightning_pose", *map(str, args)],
+            cwd=self.folder,
+            env={**os.environ, **self.environment},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    def runs(self) -> list[Run]:
+        """Every run, the newest first."""
+        experiment = self.client.get_experiment_by_name("lightning_pose")
+        return list(self.client.search_runs([experiment.experiment_id])) if experiment else []
+
+    def checkpoint(self, run: Run, name: str) -> Path:
+        return self.folder / "mlruns" / "checkpoints" / run.info.run_id / f"{name}.ckpt"
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A finished run of `fit`.
+
+    Attributes:
+        workplace: where it ran.
+        run: what MLflow knows of it.
+        stdout: what it printed.
+    """
+
+    workplace: Workplace
+    run: Run
+    stdout: str
+
+    @classmethod
+    def make(cls, workplace: Workplace, *args: object) -> Trained:
+        """Run `fit` with the workplace's config."""
+        with contextlib.redirect_stdout(io.StringIO()) as stdout:
+            assert workplace.run("fit", *args) == 0
+        return cls(workplace, workplace.runs()[0], stdout.getvalue())
+
+    @property
+    def best(self) -> Path:
+        return self.workplace.checkpoint(self.run, "best")
+
+    @property
+    def last(self) -> Path:
+        return self.workplace.checkpoint(self.run, "last")

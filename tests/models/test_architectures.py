@@ -1,0 +1,113 @@
+"""What every exported architecture must do; a new one is picked up from `lightning_pose.models` by itself."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import pytest
+import torch
+from lightning import Trainer
+
+from lightning_pose.data.batches import PoseBatch
+from lightning_pose.errors import ConfigError
+from lightning_pose.geometry import orientation_error_deg, position_error_m
+from lightning_pose.losses import LossConfig
+from lightning_pose.models import PoseModule
+from lightning_pose.spec import build
+from tests.models.helpers import ARCHITECTURES, LearnableProblem, make_model, random_poses
+
+Architecture = type[PoseModule]
+every_architecture = pytest.mark.parametrize("architecture", ARCHITECTURES, ids=lambda cls: cls.__name__)
+
+
+def features_for(model: PoseModule, count: int) -> torch.Tensor:
+    return torch.randn(count, *model.input_shape, generator=torch.Generator().manual_seed(0))
+
+
+@every_architecture
+@pytest.mark.parametrize("standardize", [True, False])
+def test_poses_have_their_shape_and_unit_quaternions(architecture: Architecture, standardize: bool) -> None:
+    model = make_model(architecture, standardize=standardize).eval()
+    model.fit_scale(*random_poses(10))
+    position_m, quat_wxyz = model(features_for(model, 5))
+    assert position_m.shape == (5, 3)
+    assert quat_wxyz.shape == (5, 4)
+    torch.testing.assert_close(quat_wxyz.norm(dim=-1), torch.ones(5))
+
+
+@every_architecture
+def test_a_blank_image_has_a_finite_pose(architecture: Architecture) -> None:
+    model = make_model(architecture).eval()
+    pose = model(torch.zeros(1, *model.input_shape))
+    assert all(tensor.isfinite().all() for tensor in pose)
+
+
+@every_architecture
+def test_a_frame_alone_is_located_as_in_a_batch(architecture: Architecture) -> None:
+    model = make_model(architecture).eval()
+    features = features_for(model, 4)
+    torch.testing.assert_close(model(features[1:2]).position_m, model(features).position_m[1:2], atol=1e-5, rtol=1e-5)
+
+
+@every_architecture
+def test_every_parameter_gets_a_finite_gradient(architecture: Architecture, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = make_model(architecture)
+    monkeypatch.setattr(model, "log_dict", lambda *args, **kwargs: None)
+    model.training_step(PoseBatch(features_for(model, 8), *random_poses(8), torch.arange(8)), 0).backward()
+    for name, parameter in model.named_parameters():
+        assert parameter.grad is not None, name
+        assert parameter.grad.isfinite().all(), name
+        assert parameter.grad.any(), name
+
+
+@every_architecture
+def test_a_checkpoint_rebuilds_the_same_model(architecture: Architecture) -> None:
+    model = make_model(architecture, learning_rate=0.02).eval()
+    model.fit_scale(*random_poses(10))
+    file = io.BytesIO()
+    torch.save({"spec": model.describe(), "state_dict": model.state_dict()}, file)
+    file.seek(0)
+    saved: dict[str, Any] = torch.load(file, weights_only=True)  # plain types only, or this refuses
+    rebuilt: PoseModule = build(saved["spec"])
+    rebuilt.load_state_dict(saved["state_dict"])
+    assert type(rebuilt) is architecture
+    assert rebuilt.learning_rate == 0.02
+    assert rebuilt.describe() == model.describe()
+    features = features_for(model, 3)
+    torch.testing.assert_close(rebuilt.eval()(features), model(features), atol=0, rtol=0)
+
+
+@every_architecture
+def test_features_of_another_rank_are_refused(architecture: Architecture) -> None:
+    shape = [3] * (architecture.input_rank + 1)
+    with pytest.raises(ConfigError, match=rf"{architecture.__name__} .*\(3, 3.*choose another data.extractor"):
+        architecture(input_shape=shape)
+
+
+@every_architecture
+def test_a_run_has_a_headline(architecture: Architecture) -> None:
+    assert make_model(architecture).headline
+
+
+@every_architecture
+def test_it_learns_what_can_be_learnt(architecture: Architecture) -> None:
+    model = make_model(architecture, loss=LossConfig(orientation_weight=5.0))
+    problem = LearnableProblem(list(model.input_shape))
+    trainer = Trainer(
+        max_epochs=25,
+        accelerator="cpu",
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+    )
+    trainer.fit(model, datamodule=problem)
+    data = problem.data.data
+    with torch.inference_mode():
+        position_m, quat_wxyz = model.eval()(data.features)
+    mean_pose_error = position_error_m(data.position_m.mean(0), data.position_m).median()
+    assert position_error_m(position_m, data.position_m).median() < mean_pose_error / 3
+    upright = torch.tensor([1.0, 0.0, 0.0, 0.0])
+    turned = orientation_error_deg(upright, data.quat_wxyz).median()
+    assert orientation_error_deg(quat_wxyz, data.quat_wxyz).median() < turned / 3

@@ -1,0 +1,115 @@
+"""PoseModule: the scale of its answers, the hemisphere of its targets, its schedules, its refusals."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import pytest
+import torch
+
+from lightning_pose.data.batches import PoseBatch
+from lightning_pose.errors import CheckpointError, ConfigError
+from lightning_pose.losses import LossConfig
+from lightning_pose.models import PoseModule, SurfCNN, SurfLSTM
+from tests.models.helpers import make_model, random_poses
+
+HALF = 0.5**0.5
+EIGHTH = math.pi / 8
+
+
+def tiny(**settings: object) -> PoseModule:
+    return make_model(SurfLSTM, units=4, layers=1, **settings)
+
+
+def test_scale_of_hand_computed_poses() -> None:
+    model = tiny()
+    position_m = torch.tensor([[1.0, 0.0, 0.0], [3.0, 0.0, 0.0]])
+    quat_wxyz = torch.tensor([[1.0, 0.0, 0.0, 0.0], [-HALF, -HALF, 0.0, 0.0]])  # none, and 90 degrees about x, flipped
+    model.fit_scale(position_m, quat_wxyz)
+    torch.testing.assert_close(model.quat_reference.abs(), torch.tensor([math.cos(EIGHTH), math.sin(EIGHTH), 0.0, 0.0]))
+    sign = model.quat_reference[0].sign()
+    mean_quat = sign * torch.tensor([(1 + HALF) / 2, HALF / 2, 0.0, 0.0])
+    torch.testing.assert_close(model.pose_mean, torch.cat([torch.tensor([2.0, 0.0, 0.0]), mean_quat]))
+    # Deviations of 1 m along one axis of three; of (1 - HALF) / 2 and HALF / 2 along two axes of four.
+    torch.testing.assert_close(model.pose_scale[:3], torch.full((3,), (1 / 3) ** 0.5))
+    torch.testing.assert_close(model.pose_scale[3:], torch.full((4,), ((1 - HALF) / 8) ** 0.5))
+
+
+def test_without_standardize_only_the_hemisphere_is_learnt() -> None:
+    model = tiny(standardize=False)
+    model.fit_scale(torch.tensor([[4.0, 5.0, 6.0]]), torch.tensor([[0.0, 0.0, 0.0, 1.0]]))
+    torch.testing.assert_close(model.pose_mean, torch.zeros(7))
+    torch.testing.assert_close(model.pose_scale, torch.ones(7))
+    torch.testing.assert_close(model.quat_reference.abs(), torch.tensor([0.0, 0.0, 0.0, 1.0]))
+
+
+def test_poses_that_are_all_equal_have_a_scale() -> None:
+    model = tiny()
+    model.fit_scale(torch.ones(3, 3), torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(3, 1))
+    assert (model.pose_scale > 0).all()
+    position_m, _ = model.eval()(torch.zeros(1, *model.input_shape))
+    torch.testing.assert_close(position_m, torch.ones(1, 3), atol=1e-4, rtol=0)
+
+
+def test_signs_of_quaternions_do_not_matter(monkeypatch: pytest.MonkeyPatch) -> None:
+    position_m, quat_wxyz = random_poses(16)
+    flipped = quat_wxyz * torch.where(torch.arange(16) % 2 == 0, 1.0, -1.0)[:, None]
+    features = torch.randn(16, 20, 64, generator=torch.Generator().manual_seed(0))
+    losses = []
+    for quats in (quat_wxyz, flipped):
+        model = tiny()
+        monkeypatch.setattr(model, "log_dict", lambda *args, **kwargs: None)
+        model.fit_scale(position_m, quats)
+        losses.append(model.training_step(PoseBatch(features, position_m, quats, torch.arange(16)), 0).item())
+    assert losses[1] == pytest.approx(losses[0], rel=1e-5)
+
+
+def test_loss_settings_are_plain_in_hyperparameters() -> None:
+    model = tiny(loss=LossConfig(form="split", orientation_weight=10.0))
+    assert model.hparams["loss"]["orientation_weight"] == 10.0
+    assert type(model.hparams["loss"]) is dict
+    assert model.loss.config == LossConfig(form="split", orientation_weight=10.0)
+
+
+def test_learned_weights_of_the_loss_are_trained() -> None:
+    names = dict(tiny(loss=LossConfig(form="split", learned_weights=True)).named_parameters())
+    assert {"loss.log_scale_position", "loss.log_scale_orientation"} <= names.keys()
+
+
+def test_the_cosine_schedule_warms_up_and_ends_at_zero(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = tiny(learning_rate=1.0, schedule="cosine")
+    monkeypatch.setattr(PoseModule, "trainer", type("Steps", (), {"estimated_stepping_batches": 100})())
+    settings = model.configure_optimizers()
+    scheduler, optimizer = settings["lr_scheduler"]["scheduler"], settings["optimizer"]
+    rates = []
+    for _ in range(100):
+        rates.append(scheduler.get_last_lr()[0])
+        optimizer.step()
+        scheduler.step()
+    assert rates[:6] == pytest.approx([0.2, 0.4, 0.6, 0.8, 1.0, 1.0])
+    assert all(a >= b for a, b in pairwise(rates[5:]))
+    assert rates[-1] < 1e-3
+    assert scheduler.get_last_lr()[0] == pytest.approx(0, abs=1e-12)
+
+
+def test_the_constant_schedule_has_no_scheduler() -> None:
+    assert isinstance(tiny(schedule="constant").configure_optimizers(), torch.optim.AdamW)
+
+
+@pytest.mark.parametrize(("name", "value"), [("learning_rate", 0.0), ("learning_rate", -1.0), ("weight_decay", -0.1)])
+def test_rates_out_of_range_are_refused(name: str, value: float) -> None:
+    with pytest.raises(ConfigError, match=rf"{name} is {value}; give"):
+        tiny(**{name: value})
+
+
+def test_a_checkpoint_of_another_architecture_is_refused() -> None:
+    saved = {"lightning_pose": {"model": make_model(SurfCNN).describe()}, "state_dict": {}}
+    with pytest.raises(CheckpointError, match="holds a SurfCNN, not a SurfLSTM; give the config"):
+        tiny().on_load_checkpoint(saved)
+
+
+def test_a_checkpoint_of_another_width_is_refused() -> None:
+    saved = {"state_dict": SurfLSTM(input_shape=[20, 68], units=4, layers=1).state_dict()}
+    with pytest.raises(CheckpointError, match=r"\(16, 68\) in the checkpoint and \(16, 64\) here; .*data.extractor"):
+        tiny().on_load_checkpoint(saved)

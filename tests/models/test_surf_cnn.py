@@ -1,0 +1,34 @@
+"""SurfCNN: the sizes of table 2.2, and settings that do not fit."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from lightning_pose.errors import ConfigError
+from lightning_pose.models import SurfCNN
+
+
+@pytest.mark.parametrize(("n_features", "parameters"), [(300, 1.31e7), (100, 6.6e6)])
+def test_the_thesis_counts_its_parameters(n_features: int, parameters: float) -> None:
+    with torch.device("meta"):
+        model = SurfCNN(input_shape=[n_features, 64])
+    assert sum(parameter.numel() for parameter in model.parameters()) == pytest.approx(parameters, rel=0.1)
+
+
+@pytest.mark.parametrize("shape", [(1, 64), (7, 33), (50, 128), (20, 68)])
+def test_any_input_has_a_pose(shape: tuple[int, int]) -> None:
+    model = SurfCNN(input_shape=list(shape), channels=[4, 4, 4, 4, 4], units=8).eval()
+    assert model(torch.randn(2, *shape)).position_m.shape == (2, 3)
+
+
+@pytest.mark.parametrize(
+    ("channels", "kernels"), [([4, 4], [3]), ([], []), ([4], [4])], ids=["lengths", "none", "even kernel"]
+)
+def test_settings_that_do_not_fit_are_refused(channels: list[int], kernels: list[int]) -> None:
+    with pytest.raises(ConfigError, match=r"channels \[.*kernels \[.*give as many of each, kernels odd"):
+        SurfCNN(input_shape=[20, 64], channels=channels, kernels=kernels)
+
+
+def test_headline() -> None:
+    assert SurfCNN(input_shape=[100, 64], channels=[4], kernels=[3], units=8).headline == "N=100"
