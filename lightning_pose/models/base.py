@@ -51,7 +51,7 @@ class PoseModule(LightningModule):
         standardize: let the network predict in standard deviations around the mean training pose.
 
     Raises:
-        ConfigError: `input_shape` does not suit the architecture.
+        ConfigError: `input_shape` does not suit the architecture, or a rate is out of its range.
     """
 
     input_rank: ClassVar[int]
@@ -79,6 +79,10 @@ class PoseModule(LightningModule):
                 f"{type(self).__name__} reads features with {self.input_rank} axes, "
                 f"not of shape {tuple(input_shape)}; choose another data.extractor"
             )
+        if not learning_rate > 0:
+            raise ConfigError(f"learning_rate is {learning_rate}; give a number above 0, such as 0.001")
+        if not weight_decay >= 0:
+            raise ConfigError(f"weight_decay is {weight_decay}; give 0 or more")
         self.input_shape = tuple(input_shape)
         self.learning_rate = learning_rate
         self.weight_decay = weight_decay

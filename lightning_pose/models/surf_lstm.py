@@ -7,6 +7,7 @@ from typing import Any, ClassVar, Literal
 import torch
 from torch import Tensor, nn
 
+from lightning_pose.errors import ConfigError
 from lightning_pose.models.base import PoseModule
 
 __all__ = ["SurfLSTM"]
@@ -27,6 +28,9 @@ class SurfLSTM(PoseModule):
         units: width of each layer and direction.
         dropout: between layers and before the last linear layer.
         **kwargs: what `PoseModule` takes.
+
+    Raises:
+        ConfigError: `layers` or `units` is not positive.
     """
 
     input_rank: ClassVar[int] = 2
@@ -41,6 +45,9 @@ class SurfLSTM(PoseModule):
         **kwargs: Any,
     ) -> None:
         super().__init__(**kwargs)
+        for name, value in (("layers", layers), ("units", units)):
+            if value < 1:
+                raise ConfigError(f"{name} is {value}; give 1 or more")
         self.cell = cell
         self.bidirectional = bidirectional
         _, width = self.input_shape
