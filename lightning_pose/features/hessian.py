@@ -46,7 +46,7 @@ def margin(layer: Number) -> Number:
 
 def carve(memory: Tensor, *shape: int) -> Tensor:
     """The head of a flat tensor, in another shape."""
-    return memory[: math.prod(shape)].view(shape)
+    return memory.narrow(0, 0, math.prod(shape)).view(shape)
 
 
 def determinants(integral: Tensor, octave: int, layer: int, first: int, scratch: Tensor, out: Tensor) -> None:
@@ -66,9 +66,10 @@ def determinants(integral: Tensor, octave: int, layer: int, first: int, scratch:
     whole = scratch.view(torch.int32)
     dxx, dyy = carve(scratch[2], batch, n, m), carve(scratch[3], batch, n, m)
     plane, line, _ = integral.stride()
+    at = integral.storage_offset() + start * (line + 1)
 
     def change(y0: int, x0: int, y1: int, x1: int, rows: int, cols: int, step: int = step) -> Tensor:
-        shape, stride, at = (batch, rows, cols), (plane, step * line, step), start * (line + 1)
+        shape, stride = (batch, rows, cols), (plane, step * line, step)
         low, high = (integral.as_strided(shape, stride, at + y * line + x) for y, x in ((y0, x0), (y1, x1)))
         return torch.sub(high, low, out=carve(whole[0], *shape))
 
