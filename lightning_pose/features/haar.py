@@ -1,8 +1,9 @@
 """SURF's orientation and descriptor: Haar wavelet responses around each keypoint, out of integral images.
 
 Bay, Ess, Tuytelaars, Van Gool: "Speeded-Up Robust Features", 2008, section 4. Windows, weights, angles and
-the order of the 64 numbers are OpenCV's: a window's first axis runs along the keypoint's angle (clockwise
-from the x axis; 270 degrees, up, for an upright keypoint), its second axis a quarter turn further.
+the order of the 64 numbers are OpenCV's: 4 x 4 fields, across the keypoint's angle and then along it, each with
+the sums of dx, dy, |dx|, |dy|, where dx is the response along the angle and dy a quarter turn further. Angles
+run clockwise from the x axis; an upright keypoint's is 270 degrees, up.
 """
 
 from __future__ import annotations

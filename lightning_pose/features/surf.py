@@ -47,7 +47,7 @@ class SURF(LocalExtractor):
     Args:
         n_features: N, how many of the strongest features to return.
         upright: do not look for each keypoint's orientation (U-SURF): faster, and what the thesis uses.
-        threshold: smallest determinant of the Hessian that makes a keypoint, on the scale of OpenCV's
+        threshold: what a keypoint's determinant of the Hessian must exceed, on the scale of OpenCV's
             hessianThreshold; 0 keeps every keypoint.
         with_geometry: as for `LocalExtractor`.
 
@@ -109,7 +109,7 @@ class SURF(LocalExtractor):
         return records
 
     def _run(self, gray: Tensor, n: int) -> SurfFeatures:
-        chunks = [self._chunk(chunk, n) for chunk in gray.split(BATCH if gray.is_cuda else 1)]
+        chunks = [self._chunk(chunk, n) for chunk in gray.split(1 if gray.device.type == "cpu" else BATCH)]
         return SurfFeatures(*(torch.cat(column) for column in zip(*chunks, strict=True)))
 
     def _chunk(self, gray: Tensor, n: int) -> SurfFeatures:
