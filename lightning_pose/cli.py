@@ -139,7 +139,10 @@ class PoseCLI(LightningCLI):
         parser.add_lightning_class_args(TestReport, "report")
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
-        self.config = parser.parse_args(args)  # Lightning's own warns that sys.argv is given as well
+        try:
+            self.config = parser.parse_args(args)  # Lightning's own warns that sys.argv is given as well
+        except UnicodeDecodeError as error:
+            raise ConfigError(f"the config is not text ({error}); give a YAML file") from error
 
     def _parse_ckpt_path(self) -> None:
         """Nothing: `_with_saved_config` has taken the settings out of the checkpoint already."""
@@ -156,8 +159,12 @@ class PoseCLI(LightningCLI):
     def before_instantiate_classes(self) -> None:
         if self.subcommand in ("validate", "predict"):
             self.config[self.subcommand].trainer.logger = False  # a look at a checkpoint is no run
-        elif self.subcommand == "fit" and self.config.fit.ckpt_path == "last":
-            self._continue_last_run()
+        elif self.subcommand == "test":
+            self.config.test.verbose = False  # the report prints a better table
+        elif self.subcommand == "fit" and self.config.fit.ckpt_path is not None:
+            if self.config.fit.ckpt_path == "last":
+                self._continue_last_run()
+            _check_resumable(self.config.fit.ckpt_path, self.config.fit)
 
     def _continue_last_run(self) -> None:
         config = self.config.fit
@@ -180,9 +187,10 @@ class PoseCLI(LightningCLI):
         return super().instantiate_trainer(**kwargs)
 
     def after_fit(self) -> None:
-        """Test the best checkpoint, in the same run."""
+        """Test the best checkpoint, in the same run; without one, after no epoch or a trial run, the model as it is."""
         best = checkpoint_folder(self.trainer) / "best.ckpt"
-        self.trainer.test(self.model, datamodule=self.datamodule, ckpt_path=str(best), verbose=False)
+        checkpoint = str(best) if best.is_file() else None
+        self.trainer.test(self.model, datamodule=self.datamodule, ckpt_path=checkpoint, verbose=False)
 
     def predict(self, model: PoseModule, datamodule: Any, **kwargs: Any) -> None:
         """Write one TUM file a sequence of the test split."""
@@ -195,39 +203,64 @@ class PoseCLI(LightningCLI):
             print(file)
 
 
+class _OptionParser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise ConfigError(f"{message}; {REMEDY}")
+
+
 def _with_saved_config(args: list[str]) -> list[str]:
     """Put the checkpoint's own settings into the command line of a verb that only reads it.
 
     Its architecture replaces the config's, which may have other widths; its data settings serve where no config is
     given. Options on the command line still win.
     """
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser = _OptionParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--ckpt_path")
     parser.add_argument("--config", "-c", action="append", default=[])
     options, rest = parser.parse_known_args(args[1:])
-    if args[0] == "fit" or options.ckpt_path is None:
+    asks = any(word == "-h" or "help" in word or word.startswith("--print_config") for word in rest)
+    if args[0] == "fit" or asks:
         return args
+    if options.ckpt_path is None:
+        raise ConfigError(f"{args[0]} needs a checkpoint; give it with --ckpt_path")
     saved = read_checkpoint(options.ckpt_path)["lightning_pose"]
     settings = {"model": {**saved["model"], "init_args": {**saved["model"]["init_args"]}}}
     del settings["model"]["init_args"]["input_shape"]  # it follows from the data
     if not options.config:
         settings["data"] = saved["data"]
     for file in options.config:
-        _check_architecture(options.ckpt_path, saved["model"]["class_path"], file)
+        _check_architecture(options.ckpt_path, saved["model"]["class_path"], _architecture_of(file))
     configs = [word for text in (*options.config, json.dumps(settings)) for word in ("--config", text)]
     return [args[0], *configs, *rest, "--ckpt_path", options.ckpt_path]
 
 
-def _check_architecture(checkpoint: str, saved: str, config: str) -> None:
-    """Refuse a config whose architecture is not the checkpoint's, before the two are mixed."""
+def _architecture_of(config: str) -> str | None:
+    """The class path of a config file's model, if it has one."""
     try:
-        asked = yaml.safe_load(Path(config).read_text())["model"]["class_path"]
-    except (OSError, yaml.YAMLError, KeyError, TypeError):
-        return  # the parser says what is wrong with it
-    if asked.rpartition(".")[2] != saved.rpartition(".")[2]:
+        return yaml.safe_load(Path(config).read_text())["model"]["class_path"]
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError):
+        return None  # the parser says what is wrong with it
+
+
+def _check_architecture(checkpoint: str, saved: str, asked: str | None) -> None:
+    """Refuse a config whose architecture is not the checkpoint's, before the two are mixed."""
+    if asked is not None and asked.rpartition(".")[2] != saved.rpartition(".")[2]:
         raise CheckpointError(
-            f"{checkpoint} holds a {saved.rpartition('.')[2]}, but {config} asks for {asked.rpartition('.')[2]}; "
-            "give the config it was trained with, or none"
+            f"{checkpoint} holds a {saved.rpartition('.')[2]}, but the config asks for {asked.rpartition('.')[2]}; "
+            "give the config it was trained with"
+        )
+
+
+def _check_resumable(checkpoint: str, config: Any) -> None:
+    """Refuse a checkpoint that training cannot go on from, before a run is opened for it."""
+    saved = read_checkpoint(checkpoint)
+    _check_architecture(checkpoint, saved["lightning_pose"]["model"]["class_path"], config.model.class_path)
+    if "optimizer_states" not in saved:
+        raise CheckpointError(f"{checkpoint} holds weights only, which can be tested; give the last.ckpt beside it")
+    epochs, most = saved["epoch"] + 1, config.trainer.max_epochs
+    if most is not None and 0 <= most <= epochs:
+        raise CheckpointError(
+            f"{checkpoint} has {epochs} epochs behind it and trainer.max_epochs is {most}; raise --trainer.max_epochs"
         )
 
 

@@ -116,7 +116,11 @@ class ImageDataModule(LightningDataModule):
         return batch_loader(self.dataset("train"), self.batch_size, shuffle=True)
 
     def val_dataloader(self) -> DataLoader[PoseBatch] | list[Any]:
-        return self._eval_loader("val") if len(self.scene.splits["val"]) else []
+        if len(self.scene.splits["val"]):
+            return self._eval_loader("val")
+        if self.trainer is not None and self.trainer.validating:
+            raise DataError(f"{self.scene.root} has no validation frames; give data.val_fraction, such as 0.1")
+        return []
 
     def test_dataloader(self) -> DataLoader[PoseBatch]:
         if not len(self.scene.splits["test"]):
