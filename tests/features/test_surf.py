@@ -56,7 +56,7 @@ def test_agrees_with_opencv(name: str, upright: bool) -> None:
     nearest, close = matches(keypoints, found.keypoints[0, : int(found.count)], pixels=0.1, scale=0.01)
     assert close.float().mean() >= 0.99
     ours = found.keypoints[0, nearest[close]]
-    torch.testing.assert_close(ours[:, 3], keypoints[close, 3], rtol=1e-4, atol=0)
+    np.testing.assert_allclose(ours[:, 3], keypoints[close, 3], rtol=1e-4, atol=0)
     assert similarity(descriptors[close], found.descriptors[0, nearest[close]]) > 0.999
     turn = (ours[:, 4] - (270 if upright else keypoints[close, 4]) + 180) % 360 - 180
     assert turn.abs().median() < 0.1
@@ -78,7 +78,7 @@ def test_rows_are_sorted_and_normalised(upright: bool) -> None:
     assert (keypoints.shape, descriptors.shape, count.tolist()) == ((1, 200, 5), (1, 200, 64), [200])
     assert (keypoints.dtype, descriptors.dtype, count.dtype) == (torch.float32, torch.float32, torch.int64)
     assert (keypoints[0, :, 3].diff() <= 0).all()
-    torch.testing.assert_close(descriptors.norm(dim=-1), torch.ones(1, 200))
+    np.testing.assert_allclose(descriptors.norm(dim=-1), 1, rtol=1e-5)
     angle = keypoints[0, :, 4]
     assert (angle == 270).all() if upright else ((angle >= 0) & (angle < 360)).all() and angle.std() > 30
 
@@ -117,12 +117,12 @@ def test_batch_equals_single() -> None:
     together = SURF(80)(images)
     for i in range(4):
         for one, all_ in zip(SURF(80)(images[i : i + 1]), together, strict=True):
-            torch.testing.assert_close(one[0], all_[i], atol=1e-6, rtol=0)
+            np.testing.assert_allclose(one[0], all_[i], atol=1e-6, rtol=0)
 
 
-@pytest.mark.parametrize("n", [80, 3000])
+@pytest.mark.parametrize("n", [80, 700])
 def test_stages_work_on_batches(n: int) -> None:
-    images = torch.cat([texture(seed=0), torch.zeros((1, 240, 320), dtype=torch.uint8), texture(seed=1)])
+    images = torch.cat([texture(120, 160), torch.zeros((1, 120, 160), dtype=torch.uint8), texture(120, 160, seed=1)])
     integral = integral_image(images)
     together = detect(integral, n, 0.0)
     index = torch.arange(3).repeat_interleave(n)
@@ -133,16 +133,16 @@ def test_stages_work_on_batches(n: int) -> None:
         alone = detect(integral[i : i + 1], n, 0.0)
         assert all(torch.equal(a[0], b[i]) for a, b in zip(alone, together, strict=True))
         one = describe(integral[i : i + 1], index[:n], alone.xy[0], alone.size[0], angles[i])
-        torch.testing.assert_close(
+        np.testing.assert_allclose(
             orientations(integral[i : i + 1], index[:n], alone.xy[0], alone.size[0]), angles[i], atol=1e-2, rtol=0
         )
-        torch.testing.assert_close(one, descriptors[i], atol=1e-6, rtol=0)
+        np.testing.assert_allclose(one, descriptors[i], atol=1e-6, rtol=0)
 
 
 def test_a_few_are_a_prefix_of_many() -> None:
     few, many = SURF(50)(image("shapes")), SURF(700)(image("shapes"))
     assert torch.equal(few.keypoints, many.keypoints[:, :50])
-    torch.testing.assert_close(few.descriptors, many.descriptors[:, :50], atol=1e-6, rtol=0)
+    np.testing.assert_allclose(few.descriptors, many.descriptors[:, :50], atol=1e-6, rtol=0)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -169,7 +169,7 @@ def test_translation_moves_keypoints() -> None:
     assert inside.sum() > 20
     nearest, close = matches(moved[inside], there.keypoints[0], pixels=0.01, scale=0.001)
     assert close.all()
-    torch.testing.assert_close(here.descriptors[0, inside], there.descriptors[0, nearest], atol=1e-4, rtol=0)
+    np.testing.assert_allclose(here.descriptors[0, inside], there.descriptors[0, nearest], atol=1e-4, rtol=0)
 
 
 def test_oriented_descriptors_turn_with_the_image() -> None:
@@ -209,7 +209,7 @@ def test_determinants_of_a_grid_and_of_single_samples_agree(octave: int, layer: 
     every = torch.full_like(row, octave), torch.full_like(row, layer), torch.zeros_like(row)
     single = determinants_at(integral, *every, row + first, col + first)
     around = torch.stack([grid[0, row + i, col + j] for i in (-1, 0, 1) for j in (-1, 0, 1)]).view_as(single)
-    torch.testing.assert_close(single, around, rtol=1e-4, atol=grid.abs().max().item() * 1e-6)
+    np.testing.assert_allclose(single, around, rtol=1e-4, atol=grid.abs().max().item() * 1e-6)
 
 
 def test_every_tensor_is_made_on_the_device_of_the_images() -> None:
