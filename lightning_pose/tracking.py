@@ -20,7 +20,17 @@ if TYPE_CHECKING:
 
 __all__ = ["MLflowLogger", "default_tracking_uri", "flatten", "last_run", "log_localizer"]
 
-REQUIREMENTS = ("torch", "lightning", "opencv-contrib-python-headless", "numpy", "scipy", "jsonargparse")
+REQUIREMENTS = (
+    "torch",
+    "lightning",
+    "opencv-contrib-python-headless",
+    "numpy",
+    "scipy",
+    "jsonargparse",
+    "safetensors",
+    "platformdirs",
+    "rich",
+)
 """What a logged model needs beside this package, which it carries along."""
 
 HOST_TAG, PROCESS_TAG = "process.host", "process.id"
@@ -65,18 +75,20 @@ class MLflowLogger(MLFlowLogger):
             run_name=run_name,
             tracking_uri=uri,
             run_id=run_id,
-            tags={HOST_TAG: socket.gethostname(), PROCESS_TAG: str(os.getpid())},
             artifact_location=(Path(root) / "artifacts").resolve().as_uri() if local else None,
         )
         self.stopped_as = "FAILED"
-        self._closed_stale = False
+        self._claimed = False
 
     @property
     def client(self) -> MlflowClient:
         """The MLflow client of the store, with the run created."""
         client = self.experiment
-        if not self._closed_stale:
-            self._closed_stale = True
+        if not self._claimed:
+            self._claimed = True
+            # A run that goes on belongs to this process now; the tags of the dead one would have it closed.
+            client.set_tag(str(self.run_id), HOST_TAG, socket.gethostname())
+            client.set_tag(str(self.run_id), PROCESS_TAG, str(os.getpid()))
             self._close_stale_runs(client)
         return client
 

@@ -7,6 +7,7 @@ import io
 import math
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -25,7 +26,7 @@ from mlflow.entities import Run
 from lightning_pose.__main__ import main
 from lightning_pose.features.base import FeatureExtractor, Record
 
-__all__ = ["REPOSITORY", "FailAt", "InterruptAt", "Thumbnails", "Trained", "Workplace", "write_scene"]
+__all__ = ["REPOSITORY", "FailAt", "InterruptAt", "TerminateAt", "Thumbnails", "Trained", "Workplace", "write_scene"]
 
 REPOSITORY = Path(__file__).parents[1]
 
@@ -77,6 +78,13 @@ class InterruptAt(FailAt):
 
     def stop(self) -> None:
         raise KeyboardInterrupt
+
+
+class TerminateAt(FailAt):
+    """Asks the process to end in the middle of an epoch."""
+
+    def stop(self) -> None:
+        signal.raise_signal(signal.SIGTERM)
 
 
 def write_scene(root: Path, train: Sequence[int] = (12, 12), test: int = 10, size: tuple[int, int] = (64, 48)) -> Path:
@@ -135,6 +143,7 @@ class Workplace:
         shutil.copy(store, folder / "mlruns" / "mlflow.db")
         config = {
             "trainer": {"max_epochs": 2, "accelerator": "cpu", "devices": 1},
+            "report": {"log_model": False},  # half of the time of so short a run
             "model": {
                 "class_path": "lightning_pose.models.SurfLSTM",
                 "init_args": {"units": 8, "layers": 1, "learning_rate": 0.01, "schedule": "constant"},
@@ -212,7 +221,7 @@ class Trained:
     def make(cls, workplace: Workplace, *args: object) -> Trained:
         """Run `fit` with the workplace's config."""
         with contextlib.redirect_stdout(io.StringIO()) as stdout:
-            assert workplace.run("fit", *args) == 0
+            assert workplace.run("fit", "--report.log_model", "true", *args) == 0
         return cls(workplace, workplace.runs()[0], stdout.getvalue())
 
     @property

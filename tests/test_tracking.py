@@ -1,0 +1,136 @@
+"""Tracking: where runs go, how they are named and closed, which one goes on, and what MLflow keeps."""
+
+from __future__ import annotations
+
+import ast
+import os
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from lightning_pose.errors import CheckpointError
+from lightning_pose.tracking import REQUIREMENTS, MLflowLogger, default_tracking_uri, flatten, last_run
+from tests.helpers import Trained, Workplace
+
+DISTRIBUTIONS = {"cv2": "opencv-contrib-python-headless", "yaml": "PyYAML", "sklearn": "scikit-learn"}
+"""Where a distribution's name is not that of its package."""
+
+LIGHTNING_BRINGS = {"torchmetrics"}
+MLFLOW_BRINGS = {"mlflow", "pandas"}
+
+
+def dead_process() -> int:
+    """The number of a process that is gone."""
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    process.wait()
+    return process.pid
+
+
+@pytest.fixture
+def logger(workplace: Workplace, monkeypatch: pytest.MonkeyPatch) -> MLflowLogger:
+    monkeypatch.chdir(workplace.folder)
+    return MLflowLogger(tracking_uri=workplace.uri)
+
+
+def test_the_environment_names_the_store(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert default_tracking_uri() == "sqlite:///mlruns/mlflow.db"
+    assert default_tracking_uri("/data/runs") == "sqlite:////data/runs/mlflow.db"
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://tracker:5000")
+    assert default_tracking_uri() == "http://tracker:5000"
+
+
+def test_settings_by_dotted_name() -> None:
+    spec = {"class_path": "a.Net", "init_args": {"units": 8, "loss": {"form": "joint"}}}
+    assert flatten({"model": spec, "seed": 0}) == {
+        "model.class_path": "a.Net",
+        "model.units": 8,
+        "model.loss.form": "joint",
+        "seed": 0,
+    }
+
+
+def test_a_run_belongs_to_its_process(logger: MLflowLogger) -> None:
+    tags = logger.client.get_run(str(logger.run_id)).data.tags
+    assert tags["process.id"] == str(os.getpid())
+    logger.finalize("success")
+    assert logger.client.get_run(str(logger.run_id)).info.status == "FINISHED"
+
+
+@pytest.mark.parametrize(
+    ("process", "host", "status"),
+    [("dead", None, "KILLED"), ("alive", None, "RUNNING"), ("dead", "another machine", "RUNNING")],
+)
+def test_runs_whose_process_is_gone_are_closed(
+    process: str, host: str | None, status: str, logger: MLflowLogger, workplace: Workplace
+) -> None:
+    run_id = str(logger.run_id)
+    number = dead_process() if process == "dead" else os.getppid()
+    logger.client.set_tag(run_id, "process.id", str(number))
+    if host:
+        logger.client.set_tag(run_id, "process.host", host)
+    following = MLflowLogger(tracking_uri=workplace.uri)
+    assert following.client.get_run(run_id).info.status == status
+    assert following.client.get_run(str(following.run_id)).info.status == "RUNNING"
+
+
+def test_a_run_that_goes_on_is_claimed(logger: MLflowLogger, workplace: Workplace) -> None:
+    run_id = str(logger.run_id)
+    logger.client.set_tag(run_id, "process.id", str(dead_process()))
+    resumed = MLflowLogger(tracking_uri=workplace.uri, run_id=run_id)
+    assert resumed.client.get_run(run_id).data.tags["process.id"] == str(os.getpid())
+    following = MLflowLogger(tracking_uri=workplace.uri)
+    assert following.client.get_run(run_id).info.status == "RUNNING"
+
+
+def test_parameters_of_a_run_that_goes_on_may_differ(logger: MLflowLogger) -> None:
+    logger.log_hyperparams({"trainer": {"max_epochs": 2}})
+    logger.log_hyperparams({"trainer": {"max_epochs": 4}, "seed": 1})
+    assert logger.client.get_run(str(logger.run_id)).data.params == {"trainer.max_epochs": "2", "seed": "1"}
+
+
+def test_the_last_run_is_the_newest_of_that_architecture_and_scene(trained: Trained) -> None:
+    def find(architecture: str, root: str) -> tuple[str, Path]:
+        checkpoints = trained.workplace.folder / "mlruns" / "checkpoints"
+        return last_run(trained.workplace.uri, "lightning_pose", checkpoints, architecture, root)
+
+    root = str(trained.workplace.scene)
+    assert find("SurfLSTM", root) == (trained.run.info.run_id, trained.last)
+    with pytest.raises(CheckpointError, match=rf"no run of SurfCNN on data.root={root} .*; leave --ckpt_path out"):
+        find("SurfCNN", root)
+    with pytest.raises(CheckpointError, match=r"on data.root=elsewhere"):
+        find("SurfLSTM", "elsewhere")
+
+
+def test_no_experiment_has_no_last_run(workplace: Workplace) -> None:
+    with pytest.raises(CheckpointError, match="no run of SurfLSTM"):
+        last_run(workplace.uri, "lightning_pose", workplace.folder, "SurfLSTM", "None")
+
+
+def test_a_logged_model_names_all_that_it_imports() -> None:
+    """Follow the imports of what a localizer needs, and compare with the requirements that MLflow installs."""
+    todo, seen, needed = ["lightning_pose.pyfunc", "lightning_pose.models", "lightning_pose.features"], set(), set()
+    while todo:
+        module = todo.pop()
+        spec = find_spec(module)
+        if module in seen or spec is None or spec.origin is None:
+            continue
+        seen.add(module)
+        for name in _imported(Path(spec.origin)):
+            (todo.append if name.startswith("lightning_pose") else needed.add)(name)
+    packages = {name.partition(".")[0] for name in needed} - set(sys.stdlib_module_names)
+    distributions = {DISTRIBUTIONS.get(package, package) for package in packages}
+    assert distributions - LIGHTNING_BRINGS - MLFLOW_BRINGS <= set(REQUIREMENTS)
+
+
+def _imported(file: Path) -> set[str]:
+    """Modules that a file imports when it is imported itself."""
+    names: set[str] = set()
+    for node in ast.parse(file.read_text()).body:
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names.add(node.module)
+    return names
