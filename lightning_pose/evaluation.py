@@ -71,7 +71,8 @@ class TestReport(Callback):
         datamodule = trainer.datamodule  # type: ignore[attr-defined]
         train, test = (datamodule.dataset(split).data for split in ("train", "test"))
         prediction = Pose(*(torch.cat(parts) for parts in zip(*self._poses, strict=True)))
-        baselines = evaluate_baselines(*train[:3], *test[:3])
+        appearance = datamodule.extractor.appearance
+        baselines = evaluate_baselines(appearance(train.features), *train[1:3], appearance(test.features), *test[1:3])
         model = {
             name.removeprefix("test/"): float(value)
             for name, value in trainer.callback_metrics.items()

@@ -173,9 +173,7 @@ def position_error_m(a: Tensor, b: Tensor) -> Tensor:
     return torch.linalg.vector_norm(a - b, dim=-1)
 
 
-def relative_pose(
-    position_a: Tensor, quat_a: Tensor, position_b: Tensor, quat_b: Tensor
-) -> tuple[Tensor, Tensor]:
+def relative_pose(position_a: Tensor, quat_a: Tensor, position_b: Tensor, quat_b: Tensor) -> tuple[Tensor, Tensor]:
     """Pose of b seen from a: `T_a^-1 T_b`, the translation in the axes of a.
 
     Args:
@@ -191,9 +189,7 @@ def relative_pose(
     return quat_rotate(inverse, position_b - position_a), quat_multiply(inverse, quat_b)
 
 
-def compose_pose(
-    position_a: Tensor, quat_a: Tensor, position_ab: Tensor, quat_ab: Tensor
-) -> tuple[Tensor, Tensor]:
+def compose_pose(position_a: Tensor, quat_a: Tensor, position_ab: Tensor, quat_ab: Tensor) -> tuple[Tensor, Tensor]:
     """Pose of b in the world, `T_a T_ab`, from the pose of a and the pose of b seen from a.
 
     Args:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import ClassVar, Literal
 
 import numpy as np
+from torch import Tensor
 
 from lightning_pose.errors import ConfigError
 from lightning_pose.images import read_gray, read_rgb
@@ -70,6 +71,10 @@ class FeatureExtractor(ABC):
         """What the networks read, out of one stored record: float32 of `feature_shape`."""
         return record[self.primary]
 
+    def appearance(self, features: Tensor) -> Tensor:
+        """What image retrieval compares, out of (B, *feature_shape): all of it, unless more was appended."""
+        return features
+
 
 class LocalExtractor(FeatureExtractor):
     """Keypoints with descriptors, strongest first; each record holds
@@ -118,6 +123,10 @@ class LocalExtractor(FeatureExtractor):
         if not self.with_geometry:
             return rows
         return np.concatenate([rows, _geometry(record)[: self.n_features]], axis=1, dtype=np.float32)
+
+    def appearance(self, features: Tensor) -> Tensor:
+        """The descriptors without their geometry, whose scale would drown them."""
+        return features[..., : self.descriptor_dim]
 
 
 def _geometry(record: Record) -> np.ndarray:
