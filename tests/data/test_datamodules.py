@@ -1,0 +1,118 @@
+"""ImageDataModule: splits, features and poses of a scene, in memory and in order."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from lightning_pose.data import datamodules
+from lightning_pose.data.datamodules import ImageDataModule
+from lightning_pose.errors import ConfigError, DataError, ImageError
+from lightning_pose.images import read_gray
+from lightning_pose.spec import build
+from tests.helpers import Thumbnails
+
+
+def module(root: Path, **settings: Any) -> ImageDataModule:
+    return ImageDataModule(Thumbnails(), root=str(root), **settings)
+
+
+def test_the_shape_of_a_frame_needs_no_scene() -> None:
+    assert ImageDataModule(Thumbnails(rows=3, columns=5), root="nowhere").input_shape == (3, 5)
+
+
+def test_features_and_poses_belong_together(scene: Path) -> None:
+    data = module(scene)
+    data.prepare_data()
+    for split in ("train", "val", "test"):
+        batch = data.dataset(split).data
+        assert batch.features.dtype == batch.position_m.dtype == batch.quat_wxyz.dtype == torch.float32
+        for row, index in enumerate(batch.frame.tolist()):
+            frame = data.scene.frames[index]
+            (record,) = data.extractor.extract([read_gray(frame.image)])
+            np.testing.assert_array_equal(batch.features[row], record["thumbnail"])
+            np.testing.assert_allclose(batch.position_m[row], frame.position_m, atol=1e-6)
+            np.testing.assert_allclose(batch.quat_wxyz[row], frame.quat_wxyz, atol=1e-6)
+
+
+def test_splits_are_disjoint_and_official(scene: Path) -> None:
+    data = module(scene)
+    frames = {split: data.dataset(split).data.frame.tolist() for split in ("train", "val", "test")}
+    assert sorted(chain.from_iterable(frames.values())) == list(range(34))
+    assert {data.scene.frames[i].sequence for i in frames["test"]} == {"seq-03"}
+    assert frames["val"]
+
+
+def test_loaders(scene: Path) -> None:
+    data = module(scene, batch_size=5, eval_batch_size=4)
+    train = list(data.train_dataloader())
+    assert max(len(batch.frame) for batch in train) == 5
+    assert sorted(torch.cat([batch.frame for batch in train]).tolist()) == data.dataset("train").data.frame.tolist()
+    test = torch.cat([batch.frame for batch in data.test_dataloader()])
+    assert test.tolist() == data.dataset("test").data.frame.tolist()
+    assert torch.equal(test, torch.cat([batch.frame for batch in data.predict_dataloader()]))
+
+
+def test_no_validation_frames_is_no_loader(scene: Path) -> None:
+    data = module(scene, val_fraction=0.0)
+    assert data.val_dataloader() == []
+    assert len(data.dataset("train")) == 24
+
+
+def test_no_test_frames_is_an_error(scene: Path) -> None:
+    data = module(scene)
+    data._scene = replace(data.scene, splits={**data.scene.splits, "test": np.array([], int)})
+    with pytest.raises(DataError, match=f"{scene} has no test frames; give"):
+        data.test_dataloader()
+
+
+def test_without_a_folder_a_room_is_rendered(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, scene: Path) -> None:
+    asked: list[tuple[Any, ...]] = []
+
+    def render(*args: object) -> Path:
+        asked.append(args)
+        return scene
+
+    monkeypatch.setenv("LIGHTNING_POSE_CACHE", str(tmp_path))
+    monkeypatch.setattr(datamodules, "render_room", render)
+    data = ImageDataModule(Thumbnails(), room_seed=3, room_frames=50)
+    assert asked == [], "not before it is needed"
+    assert len(data.scene.frames) == 34
+    ((folder, *room),) = asked
+    assert room == [3, 50]
+    assert folder.parent == tmp_path / "rooms"
+    assert folder.name.startswith("room-3-50")
+
+
+def test_a_description_rebuilds_it(scene: Path, tmp_path: Path) -> None:
+    data = module(scene, batch_size=7, cache_dir=str(tmp_path))
+    rebuilt = build(_built_extractor(data.describe()))
+    assert rebuilt.describe() == data.describe()
+    assert rebuilt.batch_size == 7
+    assert rebuilt.cache.folder == data.cache.folder
+
+
+def _built_extractor(spec: dict[str, Any]) -> dict[str, Any]:
+    return {**spec, "init_args": {**spec["init_args"], "extractor": build(spec["init_args"]["extractor"])}}
+
+
+def test_a_missing_image_is_named(scene: Path, tmp_path: Path) -> None:
+    root = Path(shutil.copytree(scene, tmp_path / "copy"))
+    data = module(root)
+    missing = data.scene.frames[4].image
+    missing.unlink()
+    with pytest.raises(ImageError, match=f"{missing} does not exist; check"):
+        data.prepare_data()
+
+
+@pytest.mark.parametrize("name", ["batch_size", "eval_batch_size"])
+def test_sizes_out_of_range_are_refused(name: str, scene: Path) -> None:
+    with pytest.raises(ConfigError, match=rf"data.{name} is 0; give 1 or more"):
+        module(scene, **{name: 0})

@@ -1,0 +1,92 @@
+"""Every config file: it parses, describes what it says, and trains end to end on a tiny rendered room."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mlflow
+import numpy as np
+import pytest
+import yaml
+
+from lightning_pose.cli import PoseCLI
+from lightning_pose.data.synthetic import render_room
+from lightning_pose.features import LocalExtractor
+from lightning_pose.models import PoseModule
+from lightning_pose.summary import RECALL_THRESHOLDS
+from tests.helpers import REPOSITORY, Workplace
+
+CONFIGS = sorted((REPOSITORY / "configs").glob("*.yaml"))
+BASELINES = ["train_mean", "retrieval_top1", "retrieval_top5", "oracle"]
+ERRORS = [f"{name}_{statistic}_{unit}" for name, unit in (("position", "m"), ("orientation", "deg"))
+          for statistic in ("median", "mean", "p95")]  # fmt: skip
+COSTS = ["train_seconds", "parameters", "checkpoint_bytes", "ms_per_frame", "features_ms_per_frame", "frame_bytes"]
+every_config = pytest.mark.parametrize("config", CONFIGS, ids=lambda path: path.stem)
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return render_room(tmp_path_factory.mktemp("rooms") / "small", frames=36, size=(96, 72))
+
+
+def test_there_are_configs() -> None:
+    assert {"quickstart", "surf_cnn", "surf_lstm"} <= {path.stem for path in CONFIGS}
+
+
+@every_config
+def test_it_describes_a_model_for_its_features(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    cli = PoseCLI(["--config", str(config), "--trainer.logger", "false"], run=False)
+    assert isinstance(cli.model, PoseModule)
+    assert cli.model.input_shape == cli.datamodule.input_shape
+    assert config.read_text().startswith("# "), "a config says what it trains"
+
+
+@every_config
+def test_it_trains_tests_and_keeps_its_results(
+    config: Path, room: Path, workplace: Workplace, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("LIGHTNING_POSE_CACHE", str(workplace.folder / "cache"))
+    small = ["--trainer.max_epochs", "1", "--trainer.accelerator", "cpu"]
+    extractor = yaml.safe_load(config.read_text())["data"]["init_args"]["extractor"]
+    if issubclass(_class_of(extractor["class_path"]), LocalExtractor):
+        small += ["--data.extractor.n_features", "20"]
+    assert workplace.command("fit", "--config", config, "--data.root", room, *small) == 0
+    (run,) = workplace.runs()
+    _check_record(run.info.status, run.data.metrics, run.data.tags)
+    table = capsys.readouterr().out
+    for system in [run.data.tags["architecture"], *BASELINES]:
+        assert f" {system} " in table
+    _check_artifacts(workplace, run.info.run_id, room)
+
+
+def _check_record(status: str, metrics: dict[str, float], tags: dict[str, str]) -> None:
+    assert status == "FINISHED"
+    assert (tags["scene"], tags["dataset"], tags["ground_truth"]) == ("small", "7scenes", "synthetic")
+    groups = ["test", *(f"baseline/{name}" for name in BASELINES)]
+    expected = {f"{group}/{name}" for group in groups for name in (*ERRORS, *RECALL_THRESHOLDS)}
+    expected |= {f"cost/{name}" for name in COSTS} | {"test/skill_position", "test/skill_orientation"}
+    expected |= {"train/loss", "val/loss", "val/position_median_m", "val/orientation_median_deg"}
+    assert expected <= metrics.keys()
+    assert all(np.isfinite(metrics[name]) for name in expected)
+
+
+def _check_artifacts(workplace: Workplace, run_id: str, room: Path) -> None:
+    def kept(folder: str) -> set[str]:
+        return {Path(file.path).name for file in workplace.client.list_artifacts(run_id, folder)}
+
+    assert "config.yaml" in kept("")
+    assert kept("checkpoints") == {"best.ckpt", "last.ckpt"}
+    assert kept("figures") == {"trajectory.png", "cumulative_errors.png", "error_vs_distance.png"}
+    assert kept("trajectories") == {"truth", "predictions"}
+    assert kept("trajectories/truth") == kept("trajectories/predictions") != set()
+    images = sorted(room.glob("seq-*/*.png"))[:2]
+    mlflow.set_tracking_uri(workplace.uri)
+    poses = mlflow.pyfunc.load_model(f"runs:/{run_id}/model").predict([str(image) for image in images])
+    assert list(poses.columns) == ["x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"]
+    assert poses.shape == (2, 7)
+
+
+def _class_of(class_path: str) -> type:
+    module, _, name = class_path.rpartition(".")
+    return getattr(__import__(module, fromlist=[name]), name)
