@@ -72,12 +72,6 @@ def test_fit_that_leaves_no_checkpoint_still_ends_in_the_table(
     assert "oracle" in capsys.readouterr().out
 
 
-def test_the_same_seed_gives_the_same_weights(workplace: Workplace, trained: Trained) -> None:
-    assert workplace.run("fit") == 0
-    again, before = weights(workplace.checkpoint(workplace.runs()[0], "last")), weights(trained.last)
-    assert all(torch.equal(again[name], before[name]) for name in before)
-
-
 def test_fit_goes_on_with_the_last_run(workplace: Workplace, tmp_path: Path) -> None:
     assert workplace.run("fit", *FULL_BATCH) == 0
     (run,) = workplace.runs()
