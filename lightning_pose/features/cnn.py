@@ -1,0 +1,187 @@
+"""Features of frozen pretrained CNNs: one pooled vector an image, or the map it was pooled from."""
+
+from __future__ import annotations
+
+import hashlib
+import threading
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import ClassVar, Literal, get_args
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from lightning_pose.errors import ConfigError, ImageError
+from lightning_pose.features.backbones import BACKBONES, Backbone, build_backbone, check_backbone
+from lightning_pose.features.base import FeatureExtractor, Record
+
+__all__ = ["CNN"]
+
+Output = Literal["vector", "map"]
+Crop = Literal["center", "whole"]
+
+_RESIZE = 256 / 224  # shorter side over crop, with which all these CNNs were tested on ImageNet
+_LOADING = threading.Lock()  # the module's, so that an extractor can be copied and pickled
+
+
+class CNN(FeatureExtractor):
+    """A frozen CNN's last feature map (C, h, w), or its mean over all cells, (C,).
+
+    A record holds `features`: float32 for a vector, float16 for a map, which is large (ResNet50's 7 x 7 x 2048
+    are 200 kB). The network is loaded by the first call of `extract` and runs on the GPU where there is one,
+    there in half precision.
+
+    Args:
+        backbone: a name of `lightning_pose.features.backbones.BACKBONES`, or the class path of any
+            `torch.nn.Module` that keeps the contract of `build_backbone`.
+        weights: `imagenet`, `places365`, `none` or the path of a checkpoint, as for `build_backbone`.
+        output: `vector` or `map`.
+        size: side of the square image that the network sees; by default the one it was trained with
+            (224; 299 for inception_v3).
+        crop: `center` cuts the square out of the middle, after the shorter side was resized to 256/224 of it,
+            as the networks were tested on ImageNet; `whole` squeezes the whole frame into it.
+
+    Raises:
+        ConfigError: an unknown backbone, output or crop, or a size too small for the network.
+        CheckpointError: weights is a path, and there is no such file; or, on first use, the weights cannot be
+            downloaded or read.
+    """
+
+    color: ClassVar[Literal["gray", "rgb"]] = "rgb"
+    primary: ClassVar[str] = "features"
+
+    def __init__(
+        self,
+        backbone: str = "efficientnet_lite0",
+        weights: str = "imagenet",
+        output: Output = "vector",
+        size: int | None = None,
+        crop: Crop = "center",
+    ) -> None:
+        check_backbone(backbone, weights)
+        for name, value, known in (("output", output, get_args(Output)), ("crop", crop, get_args(Crop))):
+            if value not in known:
+                raise ConfigError(f"{name} is {value!r}; give one of {', '.join(known)}")
+        if size is not None and size < 1:
+            raise ConfigError(f"size is {size}; give the side of the network's image in pixels, such as 224")
+        self.backbone = backbone
+        self.weights = weights
+        self.output: Output = output
+        self.size = size
+        self.crop: Crop = crop
+        self._loaded: nn.Module | None = None
+
+    @property
+    def name(self) -> str:
+        """The backbone's name, or its class's in lower case."""
+        return self.backbone.rpartition(".")[2].lower()
+
+    @cached_property
+    def settings(self) -> Mapping[str, str | int | float | bool | None]:
+        """What was asked for; weights of the user's own by a digest of them, so that a moved file is still cached."""
+        if self.backbone not in BACKBONES:
+            weights = _digest_of_state(self._network)
+        elif Path(self.weights).is_file():
+            weights = hashlib.blake2b(Path(self.weights).read_bytes(), digest_size=8).hexdigest()
+        else:
+            weights = self.weights
+        return {
+            "backbone": self.backbone,
+            "weights": weights,
+            "output": self.output,
+            "size": self._side,
+            "crop": self.crop,
+        }
+
+    @cached_property
+    def feature_shape(self) -> tuple[int, ...]:
+        """(C,) or (C, h, w); named backbones tell it from their layers alone, before any weights are there.
+
+        Raises:
+            ConfigError: the size is too small for the network, or it breaks the contract of `build_backbone`.
+        """
+        named = self.backbone in BACKBONES
+        network = Backbone(self.backbone).to("meta").eval() if named else self._network
+        rgb = torch.zeros(1, 3, self._side, self._side, device="meta" if named else _device())
+        try:
+            shape = tuple(self._run(network, rgb).shape[1:])
+        except RuntimeError as error:
+            raise ConfigError(
+                f"{self.backbone} cannot take images of size {self._side} ({error}); give a larger size, such as 224"
+            ) from error
+        if len(shape) != (3 if self.output == "map" else 1) or 0 in shape:
+            raise ConfigError(
+                f"{self.backbone} returned {shape} for each image, but output is {self.output}; its forward must "
+                "return (B, C) or (B, C, h, w), and its feature_map, where it has one, (B, C, h, w)"
+            )
+        return shape
+
+    def extract(self, images: Sequence[np.ndarray]) -> list[Record]:
+        """One record for each (H, W, 3) uint8 RGB image.
+
+        Raises:
+            ImageError: an image is not such an array, or has no pixels.
+            ConfigError: as `feature_shape`.
+            CheckpointError: the weights cannot be downloaded or read.
+        """
+        for i, image in enumerate(images):
+            if image.ndim != 3 or image.shape[2] != 3 or image.size == 0 or image.dtype != np.uint8:
+                raise ImageError(f"image {i} has shape {image.shape} and type {image.dtype}; give (H, W, 3) uint8 RGB")
+        if not images:
+            return []
+        _ = self.feature_shape  # refuses a size or a network that cannot work
+        rgb = torch.stack([self._prepare(image) for image in images]).to(_device())
+        stored = torch.float16 if self.output == "map" else torch.float32
+        return [{"features": row.numpy()} for row in self._run(self._network, rgb).to("cpu", stored)]
+
+    def features(self, record: Record) -> np.ndarray:
+        return record["features"].astype(np.float32)
+
+    @property
+    def _side(self) -> int:
+        return self.size or BACKBONES.get(self.backbone, BACKBONES["resnet50"]).size
+
+    @property
+    def _network(self) -> nn.Module:
+        with _LOADING:  # the cache extracts with several threads
+            if self._loaded is None:
+                network = build_backbone(self.backbone, self.weights).eval().requires_grad_(False)
+                self._loaded = network.to(_device())
+            return self._loaded
+
+    def _prepare(self, image: np.ndarray) -> Tensor:
+        """(H, W, 3) uint8 -> (3, side, side) in 0..1."""
+        side = self._side
+        height, width = image.shape[:2]
+        rgb = torch.from_numpy(image).permute(2, 0, 1)[None].float() / 255
+        if self.crop == "whole":
+            return _resize(rgb, side, side)[0]
+        scale = round(side * _RESIZE) / min(height, width)
+        rgb = _resize(rgb, round(height * scale), round(width * scale))
+        top, left = (rgb.shape[2] - side) // 2, (rgb.shape[3] - side) // 2
+        return rgb[0, :, top : top + side, left : left + side]
+
+    @torch.inference_mode()
+    def _run(self, network: nn.Module, rgb: Tensor) -> Tensor:
+        """(B, C) or (B, C, h, w) of (B, 3, H, W)."""
+        with torch.autocast("cuda", torch.float16, enabled=rgb.is_cuda):
+            out = getattr(network, "feature_map", network)(rgb) if self.output == "map" else network(rgb)
+        return out.float().mean((2, 3)) if self.output == "vector" and out.ndim == 4 else out
+
+
+def _resize(rgb: Tensor, height: int, width: int) -> Tensor:
+    return F.interpolate(rgb, (height, width), mode="bilinear", antialias=True)
+
+
+def _device() -> torch.device:
+    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def _digest_of_state(network: nn.Module) -> str:
+    digest = hashlib.blake2b(digest_size=8)
+    for name, value in network.state_dict().items():
+        digest.update(name.encode() + value.cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()
