@@ -54,8 +54,8 @@ BACKBONES: Mapping[str, Recipe] = {
 class Backbone(nn.Module):
     """The convolutions of a CNN of `BACKBONES`, normalisation included, up to the last map before pooling.
 
-    Fully convolutional, so it takes images of any size that leaves it a map. Its parameters lie on the meta
-    device, without memory or values, until `build_backbone` fills them.
+    Fully convolutional, so it takes images of any size that leaves it a map. Its parameters are arbitrary until
+    `build_backbone` fills them.
 
     Args:
         name: a key of `BACKBONES`.
@@ -65,6 +65,9 @@ class Backbone(nn.Module):
         super().__init__()
         recipe = BACKBONES[name]
         self.layers = _layers(name)
+        # As `to_empty`, which imports sympy for it, in seconds.
+        empty = {key: torch.empty(value.shape, dtype=value.dtype) for key, value in self.layers.state_dict().items()}
+        self.layers.load_state_dict(empty, assign=True)
         self.register_buffer("mean", torch.tensor(recipe.mean).view(1, 3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(recipe.std).view(1, 3, 1, 1), persistent=False)
 
@@ -124,7 +127,6 @@ def build_backbone(backbone: str, weights: str = "imagenet") -> nn.Module:
             _load(module, _read(Path(weights)), weights, backbone)
         return module
     module = Backbone(backbone)
-    module.layers.to_empty(device="cpu")
     if weights == "none":
         _initialize(module)
     elif weights in _OWN_WEIGHTS and (url := _url(backbone, weights)):

@@ -103,9 +103,11 @@ class CNN(FeatureExtractor):
         Raises:
             ConfigError: the size is too small for the network, or it breaks the contract of `build_backbone`.
         """
-        named = self.backbone in BACKBONES
-        network = Backbone(self.backbone).to("meta").eval() if named else self._network
-        rgb = torch.zeros(1, 3, self._side, self._side, device="meta" if named else _device())
+        if self.backbone in BACKBONES:
+            network, device = Backbone(self.backbone).eval(), torch.device("cpu")
+        else:
+            network, device = self._network, _device()
+        rgb = torch.zeros(1, 3, self._side, self._side, device=device)
         try:
             shape = tuple(self._run(network, rgb).shape[1:])
         except RuntimeError as error:
