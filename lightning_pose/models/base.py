@@ -37,7 +37,8 @@ class PoseModule(LightningModule):
     - `self.network`: features (B, *input_shape) -> (B, 7), three numbers for the position and four for the
       quaternion: with `standardize` in standard deviations around the mean training pose, otherwise in metres
       and quaternion components. The loss always compares metres and quaternion components;
-    - `input_rank`: how many axes `input_shape` must have.
+    - `input_rank`: how many axes `input_shape` must have;
+    - `feature_axis`: which axis holds the columns to standardize, if not the last.
 
     Then export it in `models/__init__.py` and give it a config. Constructor arguments are plain types: they are
     the checkpoint's hyperparameters, and rebuild the module anywhere.
@@ -49,16 +50,21 @@ class PoseModule(LightningModule):
         weight_decay: decoupled weight decay.
         schedule: `constant`, or `cosine` decay to zero over the run, after a warm-up of 5 % of its steps.
         standardize: let the network predict in standard deviations around the mean training pose.
+        standardize_features: let the network read each column of the features in standard deviations around its
+            mean over the training frames. Descriptors have unit length, so that their elements are small.
 
     Raises:
         ConfigError: `input_shape` does not suit the architecture, or a rate is out of its range.
     """
 
     input_rank: ClassVar[int]
+    feature_axis: ClassVar[int] = -1
     network: nn.Module
     pose_mean: Tensor
     pose_scale: Tensor
     quat_reference: Tensor
+    feature_mean: Tensor
+    feature_scale: Tensor
 
     def __init__(
         self,
@@ -68,6 +74,7 @@ class PoseModule(LightningModule):
         weight_decay: float = 0.0,
         schedule: Literal["constant", "cosine"] = "cosine",
         standardize: bool = True,
+        standardize_features: bool = True,
     ) -> None:
         super().__init__()
         loss = LossConfig(**loss) if isinstance(loss, dict) else loss or LossConfig()
@@ -88,12 +95,17 @@ class PoseModule(LightningModule):
         self.weight_decay = weight_decay
         self.schedule = schedule
         self.standardize = standardize
+        self.standardize_features = standardize_features
         self.loss = PoseLoss(loss)
         self.val_metrics = PoseMetrics()
         self.test_metrics = PoseMetrics()
         self.register_buffer("pose_mean", torch.zeros(7))
         self.register_buffer("pose_scale", torch.ones(7))
         self.register_buffer("quat_reference", torch.tensor([1.0, 0.0, 0.0, 0.0]))
+        columns = [1] * len(self.input_shape)
+        columns[self.feature_axis] = self.input_shape[self.feature_axis]
+        self.register_buffer("feature_mean", torch.zeros(columns))
+        self.register_buffer("feature_scale", torch.ones(columns))
 
     @property
     def headline(self) -> str:
@@ -107,7 +119,7 @@ class PoseModule(LightningModule):
 
     def _decode(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Positions in metres and quaternions not yet normalised, as the losses of the thesis compare them."""
-        pose = self.network(features) * self.pose_scale + self.pose_mean
+        pose = self.network((features - self.feature_mean) / self.feature_scale) * self.pose_scale + self.pose_mean
         return pose[..., :3], pose[..., 3:]
 
     def fit_scale(self, position_m: Tensor, quat_wxyz: Tensor) -> None:
@@ -124,10 +136,22 @@ class PoseModule(LightningModule):
                 variance = (poses[:, part] - self.pose_mean[part]).square().mean()
                 self.pose_scale[part] = variance.sqrt().clamp(min=1e-6)
 
+    def fit_feature_scale(self, features: Tensor) -> None:
+        """Learn each column's mean and spread from (B, *input_shape) training features.
+
+        Rows of zeros, where a frame had fewer features, do not count. A thousand frames tell enough.
+        """
+        rows = features[:: -(-len(features) // 1000)].movedim(self.feature_axis, -1).flatten(0, -2)
+        rows = rows[rows.any(1)]
+        if self.standardize_features and len(rows) > 1:
+            self.feature_mean.copy_(rows.mean(0).view_as(self.feature_mean))
+            self.feature_scale.copy_(rows.std(0).clamp(min=1e-6).view_as(self.feature_scale))
+
     def setup(self, stage: str) -> None:
         if stage == "fit":
             train = self.trainer.datamodule.dataset("train").data  # type: ignore[attr-defined]
             self.fit_scale(train.position_m.to(self.device), train.quat_wxyz.to(self.device))
+            self.fit_feature_scale(train.features)
 
     def _step(self, batch: PoseBatch, stage: Stage) -> tuple[Tensor, Pose]:
         """The one step behind training, validation and test: decode, compare, log."""
