@@ -183,7 +183,7 @@ class PoseCLI(LightningCLI):
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
         config = self.config if self.subcommand is None else self.config[self.subcommand]
-        self.recorder.config_yaml = self._parser(self.subcommand).dump(config, skip_none=False)
+        self.recorder.config_yaml = self._parser(self.subcommand).dump(config, skip_unset=False)
         return super().instantiate_trainer(**kwargs)
 
     def after_fit(self) -> None:
@@ -267,8 +267,10 @@ def _check_resumable(checkpoint: str, config: Any) -> None:
 def main(argv: list[str]) -> int:
     """Run one of LightningCLI's verbs; `argv` begins with it."""
     # What Lightning tells of devices and restored files is no news to a user of this command line.
-    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    for name in ("lightning.pytorch", "lightning.fabric"):
+        logging.getLogger(name).setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", message=".*LeafSpec.*")  # Lightning's own use of torch
+    warnings.filterwarnings("ignore", message=".*dirpath has changed|Checkpoint directory .* exists")  # resumed runs
     try:
         PoseCLI(argv)
     except SIGTERMException:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import socket
+import warnings
 from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
@@ -176,8 +177,11 @@ def log_localizer(logger: MLflowLogger, checkpoint: Path) -> None:
     """Keep a localizer in the run as `model`, for `mlflow.pyfunc.load_model`."""
     import mlflow
 
+    os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
+    logging.getLogger("mlflow.utils.environment").setLevel(logging.ERROR)  # it misses pip, which uv does without
     mlflow.set_tracking_uri(logger.uri)
-    with mlflow.start_run(run_id=str(logger.run_id)):
+    with mlflow.start_run(run_id=str(logger.run_id)), warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # the model takes files, for which MLflow has no schema
         mlflow.pyfunc.log_model(
             name="model",
             python_model=str(Path(__file__).with_name("pyfunc.py")),
