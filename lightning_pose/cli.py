@@ -100,6 +100,14 @@ def _help(verb: str) -> dict[str, Any]:
     }
 
 
+def _quieten() -> None:
+    """Drop what Lightning tells of devices, restored files and its own use of torch: no user can act on it."""
+    for name in ("lightning.pytorch", "lightning.fabric"):
+        logging.getLogger(name).setLevel(logging.WARNING)
+    warnings.filterwarnings("ignore", message=".*LeafSpec.*")  # Lightning's own use of torch
+    warnings.filterwarnings("ignore", message=".*dirpath has changed|Checkpoint directory .* exists")  # resumed runs
+
+
 class PoseCLI(LightningCLI):
     """`python -m lightning_pose fit | validate | test | predict`.
 
@@ -109,6 +117,7 @@ class PoseCLI(LightningCLI):
     """
 
     def __init__(self, args: list[str], run: bool = True) -> None:
+        _quieten()
         self.recorder = RunRecorder()
         super().__init__(
             model_class=PoseModule,
@@ -266,11 +275,6 @@ def _check_resumable(checkpoint: str, config: Any) -> None:
 
 def main(argv: list[str]) -> int:
     """Run one of LightningCLI's verbs; `argv` begins with it."""
-    # What Lightning tells of devices and restored files is no news to a user of this command line.
-    for name in ("lightning.pytorch", "lightning.fabric"):
-        logging.getLogger(name).setLevel(logging.WARNING)
-    warnings.filterwarnings("ignore", message=".*LeafSpec.*")  # Lightning's own use of torch
-    warnings.filterwarnings("ignore", message=".*dirpath has changed|Checkpoint directory .* exists")  # resumed runs
     try:
         PoseCLI(argv)
     except SIGTERMException:
