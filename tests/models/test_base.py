@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from itertools import pairwise
 
+import numpy as np
 import pytest
 import torch
 
@@ -111,5 +112,20 @@ def test_a_checkpoint_of_another_architecture_is_refused() -> None:
 
 def test_a_checkpoint_of_another_width_is_refused() -> None:
     saved = {"state_dict": SurfLSTM(input_shape=[20, 68], units=4, layers=1).state_dict()}
-    with pytest.raises(CheckpointError, match=r"\(16, 68\) in the checkpoint and \(16, 64\) here; .*data.extractor"):
+    with pytest.raises(CheckpointError, match=r"\(1, 68\) in the checkpoint and \(1, 64\) here; .*data.extractor"):
         tiny().on_load_checkpoint(saved)
+
+
+def test_features_are_read_in_standard_deviations_and_empty_rows_do_not_count() -> None:
+    model = SurfLSTM(input_shape=[2, 3])
+    features = torch.tensor([[[1.0, 10.0, 5.0], [0.0, 0.0, 0.0]], [[3.0, 30.0, 5.0], [5.0, 50.0, 5.0]]])
+    model.fit_feature_scale(features)
+    np.testing.assert_allclose(model.feature_mean, [[3.0, 30.0, 5.0]])
+    np.testing.assert_allclose(model.feature_scale, [[2.0, 20.0, 1e-6]], rtol=1e-6)
+
+
+def test_features_are_read_as_they_are_without_standardize_features() -> None:
+    model = SurfLSTM(input_shape=[2, 3], standardize_features=False)
+    model.fit_feature_scale(torch.randn(4, 2, 3))
+    np.testing.assert_allclose(model.feature_mean, np.zeros((1, 3)))
+    np.testing.assert_allclose(model.feature_scale, np.ones((1, 3)))
