@@ -282,6 +282,6 @@ def main(argv: list[str]) -> int:
     except SystemExit as stop:
         # Lightning turns Ctrl-C into exit code 1, once it has closed the run.
         if stop.code == 1:
-            raise KeyboardInterrupt from stop
+            raise KeyboardInterrupt("`fit --ckpt_path last`, with the same settings, goes on") from stop
         raise
     return 0
