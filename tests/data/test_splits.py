@@ -29,10 +29,10 @@ def blocks(indices: np.ndarray) -> list[tuple[int, int]]:
     return [(int(run[0]), int(run[-1])) for run in runs]
 
 
-def test_short_sequences_are_held_out_whole() -> None:
-    """13 sequences of 50, 65 frames wanted: two sequences, spread, as on redkitchen."""
+def test_short_sequences_are_held_out_in_halves() -> None:
+    """13 sequences of 50, 65 frames wanted: last and first halves of four, spread, as on redkitchen."""
     splits = make_splits(scene([50] * 13 + [150], official=True), 0.1, 0.2)
-    assert blocks(splits["val"]) == [(150, 199), (450, 499)]
+    assert blocks(splits["val"]) == [(75, 99), (200, 224), (425, 449), (550, 574)]
     assert {k: len(v) for k, v in splits.items()} == {"train": 550, "val": 100, "test": 150}
     np.testing.assert_array_equal(splits["test"], np.arange(650, 800))
 
@@ -47,7 +47,7 @@ def test_one_trajectory_without_a_split() -> None:
     splits = make_splits(scene([373]), 0.1, 0.2)
     assert {k: len(v) for k, v in splits.items()} == {"train": 268, "val": 30, "test": 75}
     assert len(blocks(splits["test"])) == 4
-    assert [last - first + 1 for first, last in blocks(splits["val"])] == [15, 15]
+    assert [last - first + 1 for first, last in blocks(splits["val"])] == [10, 10, 10]
 
 
 @pytest.mark.parametrize("lengths", [[10], [100], [5] * 30, [7, 300, 2, 60], [1] * 40, [3000]])
