@@ -119,7 +119,17 @@ class PoseModule(LightningModule):
 
     def _decode(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Positions in metres and quaternions not yet normalised, as the losses of the thesis compare them."""
-        pose = self.network((features - self.feature_mean) / self.feature_scale) * self.pose_scale + self.pose_mean
+        return self._unscaled(self.network(self._standardized(features)))
+
+    def _decode_batch(self, batch: PoseBatch) -> tuple[Tensor, Tensor]:
+        """As `_decode`, for an architecture that must know which frames it is trained on."""
+        return self._decode(batch.features)
+
+    def _standardized(self, features: Tensor) -> Tensor:
+        return (features - self.feature_mean) / self.feature_scale
+
+    def _unscaled(self, pose: Tensor) -> tuple[Tensor, Tensor]:
+        pose = pose * self.pose_scale + self.pose_mean
         return pose[..., :3], pose[..., 3:]
 
     def fit_scale(self, position_m: Tensor, quat_wxyz: Tensor) -> None:
@@ -155,7 +165,7 @@ class PoseModule(LightningModule):
 
     def _step(self, batch: PoseBatch, stage: Stage) -> tuple[Tensor, Pose]:
         """The one step behind training, validation and test: decode, compare, log."""
-        position_m, quat_raw = self._decode(batch.features)
+        position_m, quat_raw = self._decode_batch(batch)
         target = align_hemisphere(batch.quat_wxyz, self.quat_reference)
         terms = self.loss(position_m, quat_raw, batch.position_m, target)
         names = {f"{stage}/loss" if name == "total" else f"{stage}/loss_{name}": t for name, t in terms.items()}
