@@ -1,0 +1,105 @@
+"""Graphs of nearest neighbours: the search, its edges, and the part of a graph that some nodes depend on.
+
+A graph is a table (N, K) of int64: row i holds the nodes that node i hears, nearest first, and `ABSENT` in
+the places that stay empty.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+__all__ = ["ABSENT", "edge_index", "neighbourhood", "neighbours_within", "sample_neighbours", "search_neighbours"]
+
+ABSENT = -1
+_CHUNK_ELEMENTS = 2**22  # of the distances in memory at a time: 16 MB
+
+
+def search_neighbours(
+    query: Tensor,
+    reference: Tensor,
+    k: int,
+    query_frame: Tensor | None = None,
+    reference_frame: Tensor | None = None,
+    gap: int = 1,
+) -> Tensor:
+    """The k nearest rows of `reference` by L2 for each row of `query`, searched in chunks of bounded memory.
+
+    Args:
+        query: (Q, D).
+        reference: (N, D).
+        k: how many.
+        query_frame: (Q,) places along the trajectory; where given, only reference rows at least `gap` away count.
+        reference_frame: (N,) of the same trajectory; needed with `query_frame`.
+        gap: 1 keeps a node from being its own neighbour.
+
+    Returns:
+        (Q, k) table, nearest first.
+    """
+    table = torch.full((len(query), k), ABSENT, device=query.device)
+    most = min(k, len(reference))
+    for rows in torch.arange(len(query), device=query.device).split(max(1, _CHUNK_ELEMENTS // max(1, len(reference)))):
+        distance = torch.cdist(query[rows], reference)
+        if query_frame is not None and reference_frame is not None:
+            near_in_time = (query_frame[rows, None] - reference_frame).abs() < gap
+            distance = distance.masked_fill(near_in_time, torch.inf)
+        nearest = distance.topk(most, largest=False)
+        table[rows, :most] = nearest.indices.masked_fill(nearest.values.isinf(), ABSENT)
+    return table
+
+
+def neighbours_within(nodes: Tensor, k: int) -> Tensor:
+    """The k nearest other nodes of the same graph, for B graphs of M nodes at once.
+
+    Args:
+        nodes: (B, M, D).
+        k: how many; all others where there are fewer.
+
+    Returns:
+        (B * M, min(k, M - 1)) table of one graph, in which the B are apart.
+    """
+    B, M, _ = nodes.shape
+    distance = torch.cdist(nodes.detach(), nodes.detach())
+    distance.diagonal(dim1=1, dim2=2).fill_(torch.inf)
+    nearest = distance.topk(min(k, M - 1), largest=False).indices
+    first = torch.arange(0, B * M, M, device=nodes.device)
+    return (nearest + first[:, None, None]).flatten(0, 1)
+
+
+def edge_index(table: Tensor) -> Tensor:
+    """(2, E) edges as PyG reads them, from each neighbour (first row) to the node that hears it (second row)."""
+    node, place = (table != ABSENT).nonzero(as_tuple=True)
+    return torch.stack([table[node, place], node])
+
+
+def sample_neighbours(table: Tensor, count: int) -> Tensor:
+    """(N, min(count, K)): neighbours of each node drawn without replacement (Hamilton et al., NeurIPS 2017)."""
+    places = torch.rand(table.shape, device=table.device).topk(min(count, table.shape[1]), dim=1).indices
+    return table.gather(1, places)
+
+
+def neighbourhood(table: Tensor, seeds: Tensor, hops: int) -> tuple[Tensor, Tensor, Tensor]:
+    """The part of a graph on which the states of some nodes depend after as many convolutions.
+
+    PyG's NeighborLoader does this with compiled packages (pyg-lib, torch-sparse) that torch-geometric does not
+    bring along; a table needs no more than indexing.
+
+    Args:
+        table: (N, K) the whole graph.
+        seeds: (B,) the nodes.
+        hops: how many convolutions.
+
+    Returns:
+        nodes: (M,) those that matter; the rest numbers them 0 to M - 1.
+        table: (M, K) the graph of these; what lies outside is absent.
+        seeds: (B,).
+    """
+    kept = torch.zeros(len(table), dtype=torch.bool, device=table.device)
+    kept[seeds] = True
+    for _ in range(hops):
+        reached = table[kept].flatten()
+        kept[reached[reached != ABSENT]] = True
+    nodes = kept.nonzero().squeeze(1)
+    number = torch.full((len(table) + 1,), ABSENT, device=table.device)  # the last one is that of absent nodes
+    number[nodes] = torch.arange(len(nodes), device=table.device)
+    return nodes, number[table[nodes]], number[seeds]

@@ -1,0 +1,86 @@
+"""Graph convolutions of PyTorch Geometric behind one face, in which nodes that hear need not be those that speak."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from lightning_pose.errors import ConfigError
+
+__all__ = ["GraphConvolution", "PoseHeads"]
+
+_SHORT_NAMES = {"wl": "GraphConv", "gcn": "GCNConv"}
+
+
+class GraphConvolution(nn.Module):
+    """One convolution from source nodes to target nodes.
+
+    Args:
+        conv: `wl` (PyG's GraphConv: Morris et al., AAAI 2019), `gcn` (GCNConv: Kipf & Welling, ICLR 2017), or the
+            name of any convolution of `torch_geometric.nn` that takes different source and target nodes, such as
+            SAGEConv, GATConv, GATv2Conv or TransformerConv.
+        in_width: columns of a node's state.
+        out_width: columns of its new state.
+        aggr: how messages are brought together: `add`, `mean` or `max`; the convolution's own way if not given.
+
+    Raises:
+        ConfigError: there is no such convolution, or it cannot be built from two widths.
+    """
+
+    def __init__(self, conv: str, in_width: int, out_width: int, aggr: str | None = None) -> None:
+        super().__init__()
+        # Seconds to import, which would be paid for every architecture.
+        from torch_geometric import nn as pyg
+
+        name = _SHORT_NAMES.get(conv, conv)
+        self.is_gcn = name == "GCNConv"
+        # A neighbour's degree is not known here, so that GCN gets its weights from us.
+        options: dict[str, Any] = {"normalize": False} if self.is_gcn else {}
+        if aggr is not None:
+            options["aggr"] = aggr
+        try:
+            self.layer: nn.Module = getattr(pyg, name)(in_width, out_width, **options)
+            with torch.no_grad():
+                shape = self(torch.zeros(1, in_width), torch.zeros(2, in_width), torch.tensor([[0, 1], [0, 0]])).shape
+        except (AttributeError, TypeError, ValueError, RuntimeError, AssertionError) as error:
+            raise ConfigError(
+                f"conv {conv!r} with aggr {aggr!r} cannot be built ({error}); give wl, gcn, or a convolution of "
+                "torch_geometric.nn from source to target nodes, such as SAGEConv or GATConv"
+            ) from error
+        if shape != (1, out_width):
+            raise ConfigError(f"conv {conv!r} answers with shape {tuple(shape)}, not {(1, out_width)}; give another")
+
+    def forward(self, target: Tensor, source: Tensor, edges: Tensor) -> Tensor:
+        """Let targets hear their neighbours.
+
+        Args:
+            target: (B, in_width).
+            source: (M, in_width); may be `target` itself.
+            edges: (2, E), rows of `source` above rows of `target`.
+
+        Returns:
+            (B, out_width), without an activation.
+        """
+        if not self.is_gcn:
+            return self.layer((source, target), edges)
+        # Every node hears equally many, so GCN's D^-1/2 (A + I) D^-1/2 is the mean over a node and its neighbours.
+        B = len(target)
+        itself = torch.arange(B, device=target.device)
+        nodes, first = (target, 0) if source is target else (torch.cat([target, source]), B)
+        into = torch.cat([edges[1], itself])
+        weight = 1 / torch.bincount(into, minlength=B)[into].to(target.dtype)
+        return self.layer(nodes, torch.stack([torch.cat([edges[0] + first, itself]), into]), weight)[:B]
+
+
+class PoseHeads(nn.Module):
+    """Two linear layers side by side: (B, width) -> (B, 7), three for the position and four for the quaternion."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.position = nn.Linear(width, 3)
+        self.quat = nn.Linear(width, 4)
+
+    def forward(self, state: Tensor) -> Tensor:
+        return torch.cat([self.position(state), self.quat(state)], dim=-1)

@@ -1,0 +1,205 @@
+"""NodePose: what queries hear, what they must not, the memory in its checkpoint, and its sizes."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch_geometric.nn import GCNConv, GraphConv
+
+from lightning_pose.data.batches import PoseBatch
+from lightning_pose.data.graph import edge_index, search_neighbours
+from lightning_pose.errors import CheckpointError, ConfigError
+from lightning_pose.models import NodePose
+from tests.models.helpers import random_poses
+
+WIDTH = 16
+CONVOLUTIONS = ["wl", "gcn", "SAGEConv", "GATConv"]
+
+
+def frames(count: int, seed: int = 0) -> PoseBatch:
+    features = torch.randn(count, WIDTH, generator=torch.Generator().manual_seed(seed))
+    return PoseBatch(features, *random_poses(count, seed), torch.arange(count))
+
+
+def make(count: int = 30, **settings: Any) -> NodePose:
+    torch.manual_seed(0)
+    settings = {"neighbours": 3, "channels": [12, 8, 8], **settings}
+    model = NodePose(input_shape=[WIDTH], **settings)
+    train = frames(count)
+    model.fit_scale(train.position_m, train.quat_wxyz)
+    model.fit_feature_scale(train.features)
+    model.remember(train)
+    return model.eval()
+
+
+def decode(model: NodePose, features: Tensor) -> Tensor:
+    return torch.cat(model._decode(features), dim=1)
+
+
+@pytest.mark.parametrize("neighbour_poses", [False, True])
+@pytest.mark.parametrize("conv", CONVOLUTIONS)
+def test_an_answer_does_not_depend_on_the_batch(conv: str, neighbour_poses: bool) -> None:
+    model = make(conv=conv, neighbour_poses=neighbour_poses)
+    queries = frames(9, seed=1).features
+    together = decode(model, queries)
+    for size in (1, 2, 5):
+        apart = torch.cat([decode(model, part) for part in queries.split(size)])
+        torch.testing.assert_close(apart, together, atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(decode(model, queries.repeat(3, 1))[:9], together, atol=1e-5, rtol=1e-5)
+
+
+def test_queries_never_hear_each_other() -> None:
+    model = make(neighbour_poses=True)
+    queries = frames(4, seed=1).features.requires_grad_()
+    for row, pose in enumerate(decode(model, queries)):
+        (gradient,) = torch.autograd.grad(pose.sum(), queries, retain_graph=True)
+        assert gradient.any(1).nonzero().flatten().tolist() == [row]
+
+
+@pytest.mark.parametrize(("conv", "layer"), [("wl", GraphConv), ("gcn", GCNConv)])
+def test_it_equals_pyg_on_the_joint_graph_of_training_images_and_queries(conv: str, layer: type) -> None:
+    model = make(conv=conv)
+    queries = frames(5, seed=1).features
+    nodes = torch.cat([model.memory_features, queries])
+    table = torch.cat(
+        [
+            model.memory_table,
+            search_neighbours(*(torch.nn.functional.normalize(x, dim=1) for x in (queries, model.memory_features)), 3),
+        ]
+    )
+    state, edges = (nodes - model.feature_mean) / model.feature_scale, edge_index(table)
+    for convolution in model.network.convolutions:
+        plain = layer(*(12, 8) if state.shape[1] == 12 else (state.shape[1], convolution.layer.out_channels))
+        plain.load_state_dict(convolution.layer.state_dict())
+        state = plain(state, edges).relu()
+    expected = model.network.heads(state[30:]) * model.pose_scale + model.pose_mean
+    torch.testing.assert_close(decode(model, queries), expected, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("neighbour_poses", [False, True])
+def test_a_training_node_never_sees_its_own_pose(neighbour_poses: bool) -> None:
+    model = make(neighbour_poses=neighbour_poses, conv="wl").train()
+    batch = frames(30)
+    model.memory_pose = model.memory_pose.clone().requires_grad_()
+    answers = torch.cat(model._decode_batch(batch), dim=1)
+    for row in range(30):
+        (gradient,) = torch.autograd.grad(answers[row].sum(), model.memory_pose, retain_graph=True, allow_unused=True)
+        if neighbour_poses:
+            heard = gradient.any(1).nonzero().flatten().tolist()
+            assert heard == sorted(model.memory_table[row].tolist())
+            assert row not in heard
+        else:
+            assert gradient is None
+
+
+@pytest.mark.parametrize("neighbour_poses", [False, True])
+def test_training_and_test_agree_on_a_node(neighbour_poses: bool) -> None:
+    model = make(neighbour_poses=neighbour_poses)
+    batch = frames(30)
+    far = batch._replace(features=batch.features[[7]], frame=batch.frame[[7]])
+    trained = torch.cat(model.train()._decode_batch(far), dim=1)
+    model.eval()
+    _, states = model._remembered()
+    table, target = model.memory_table[[7]], states[0][[7]]
+    for layer, source in enumerate(states[:-1]):
+        target = model.network.hidden(layer, target, source, table)
+    answer = model.network.answer(target, states[-1], table, model.memory_pose)
+    torch.testing.assert_close(torch.cat(model._unscaled(answer), dim=1), trained, atol=1e-5, rtol=1e-5)
+
+
+def test_a_sampled_graph_with_all_neighbours_is_the_full_graph() -> None:
+    batch = PoseBatch(*(tensor[[3, 20, 11]] for tensor in frames(30)))
+    full = torch.cat(make().train()._decode_batch(batch), dim=1)
+    sampled = torch.cat(make(full_graph_limit=0).train()._decode_batch(batch), dim=1)
+    torch.testing.assert_close(sampled, full, atol=1e-5, rtol=1e-5)
+
+
+def test_memory_is_in_the_order_of_frames() -> None:
+    train = frames(30)
+    model, shuffled = make(), make()
+    shuffled.remember(PoseBatch(*(tensor.flip(0) for tensor in train)))
+    queries = frames(5, seed=1).features
+    torch.testing.assert_close(decode(shuffled, queries), decode(model, queries))
+    assert torch.equal(shuffled.memory_frame, torch.arange(30))
+
+
+def test_frames_within_the_gap_are_not_joined() -> None:
+    table = make(gap=10).memory_table
+    own = torch.arange(30)[:, None]
+    assert ((table - own).abs() >= 10).all()
+    pairs = list(combinations(range(30), 2))
+    assert any(abs(i - j) < 10 for i, j in pairs if j in make().memory_table[i])
+
+
+def test_answers_follow_the_weights() -> None:
+    model = make()
+    queries = frames(3, seed=1).features
+    before = decode(model, queries).detach()
+    model.train()._decode_batch(frames(30))  # as a step would, after which Lightning sets `training` by itself
+    with torch.no_grad():
+        model.network.convolutions[0].layer.lin_rel.weight.mul_(2)
+    for module in model.modules():
+        module.training = False
+    assert not torch.allclose(decode(model, queries), before)
+
+
+def test_answers_under_inference_mode_can_be_followed_by_gradients() -> None:
+    model = make()
+    queries = frames(3, seed=1).features
+    with torch.inference_mode():
+        model(queries)
+    model(queries).position_m.sum().backward()
+
+
+@pytest.mark.parametrize("way", ["load_state_dict", "on_load_checkpoint"])
+def test_a_checkpoint_brings_its_memory(way: str) -> None:
+    model = make(neighbour_poses=True)
+    fresh = NodePose(input_shape=[WIDTH], neighbours=3, channels=[12, 8, 8], neighbour_poses=True).eval()
+    if way == "on_load_checkpoint":
+        fresh.on_load_checkpoint({"state_dict": model.state_dict()})
+    fresh.load_state_dict(model.state_dict())
+    queries = frames(5, seed=1).features
+    torch.testing.assert_close(decode(fresh, queries), decode(model, queries), atol=0, rtol=0)
+
+
+def test_a_checkpoint_of_other_features_or_neighbours_is_refused() -> None:
+    saved = {"state_dict": make().state_dict()}
+    with pytest.raises(CheckpointError, match=r"\(16,\) in the checkpoint and \(17,\) here.*data.extractor"):
+        NodePose(input_shape=[WIDTH + 1], neighbours=3, channels=[12, 8, 8]).on_load_checkpoint(saved)
+    with pytest.raises(CheckpointError, match=r"memory_table has shape \(30, 3\) .* \(30, 4\) here"):
+        NodePose(input_shape=[WIDTH], neighbours=4, channels=[12, 8, 8]).on_load_checkpoint(saved)
+
+
+def test_fewer_training_images_than_neighbours_will_do() -> None:
+    model = make(count=2, neighbours=5, neighbour_poses=True)
+    assert decode(model, frames(3, seed=1).features).isfinite().all()
+    assert torch.cat(model.train()._decode_batch(frames(2)), dim=1).isfinite().all()
+
+
+@pytest.mark.parametrize(("conv", "factor"), [("wl", 2), ("gcn", 1)])
+def test_parameters_of_the_thesis(conv: str, factor: int) -> None:
+    model = NodePose(input_shape=[2048], conv=conv)
+    weights = 2048 * 256 + 256 * 128 + 128 * 64
+    assert sum(p.numel() for p in model.network.parameters()) == factor * weights + 256 + 128 + 64 + 65 * 7
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"neighbours": 0}, r"neighbours is 0; give 1 or more"),
+        ({"gap": 0}, r"gap is 0; give 1 or more"),
+        ({"fanout": 0}, r"fanout is 0; give 1 or more"),
+        ({"channels": []}, r"channels are \[\].*give widths"),
+        ({"dropout": 1.0}, r"dropout is 1.0; give"),
+        ({"conv": "NoConv"}, r"conv 'NoConv' .*cannot be built.*give wl, gcn"),
+        ({"conv": "ChebConv"}, r"conv 'ChebConv' .*cannot be built.*SAGEConv"),
+        ({"aggr": "sideways"}, r"aggr 'sideways' cannot be built"),
+    ],
+)
+def test_settings_out_of_range_are_refused(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        NodePose(input_shape=[WIDTH], **settings)
