@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-__all__ = ["PoseBatch", "PoseDataset", "batch_loader"]
+__all__ = ["DrawnDataset", "PoseBatch", "PoseDataset", "batch_loader"]
 
 
 class PoseBatch(NamedTuple):
@@ -41,6 +42,28 @@ class PoseDataset(Dataset[PoseBatch]):
 
     def __getitems__(self, indices: Sequence[int]) -> PoseBatch:
         return PoseBatch(*(tensor[list(indices)] for tensor in self.data))
+
+
+class DrawnDataset(PoseDataset):
+    """One split with more features a frame than a batch has: each time, another draw of them, in their order.
+
+    Args:
+        data: features (F, M, D), strongest first.
+        n_features: how many of the M features a batch has.
+    """
+
+    def __init__(self, data: PoseBatch, n_features: int) -> None:
+        super().__init__(data)
+        self.n_features = n_features
+
+    def __getitem__(self, index: int) -> PoseBatch:
+        return PoseBatch(*(tensor[0] for tensor in self.__getitems__([index])))
+
+    def __getitems__(self, indices: Sequence[int]) -> PoseBatch:
+        batch = super().__getitems__(indices)
+        frames, pool, _ = batch.features.shape
+        drawn = torch.rand(frames, pool).argsort(dim=1)[:, : self.n_features].sort(dim=1).values
+        return batch._replace(features=batch.features[torch.arange(frames)[:, None], drawn])
 
 
 def _as_is(batch: Any) -> PoseBatch:

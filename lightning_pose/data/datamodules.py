@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +11,12 @@ import torch
 from lightning import LightningDataModule
 from torch.utils.data import DataLoader
 
-from lightning_pose.data.batches import PoseBatch, PoseDataset, batch_loader
+from lightning_pose.data.batches import DrawnDataset, PoseBatch, PoseDataset, batch_loader
 from lightning_pose.data.formats import load_scene
 from lightning_pose.data.scene import Scene
 from lightning_pose.data.synthetic import RENDERER_VERSION, render_room
 from lightning_pose.errors import ConfigError, DataError
-from lightning_pose.features import FeatureCache, FeatureExtractor
+from lightning_pose.features import FeatureCache, FeatureExtractor, LocalExtractor
 from lightning_pose.features.cache import FillReport
 from lightning_pose.folders import cache_folder
 from lightning_pose.spec import describe
@@ -33,6 +34,9 @@ class ImageDataModule(LightningDataModule):
         val_fraction: part of the training split kept for validation, in whole blocks of the trajectory; 0 for none.
         batch_size: frames in a training batch.
         eval_batch_size: frames in a batch where no gradient is needed.
+        feature_pool: in training, draw the features of each frame at random from this many of its strongest, anew
+            in every epoch, so that no frame is known by heart; validation and test read the strongest. None never
+            draws. For extractors of local features only, and at most the 300 that the cache holds, or N.
         cache_dir: where extracted features are kept; the user's cache folder if not given.
         workers: processes or threads that extract features; every core if not given.
         room_seed: which synthetic room.
@@ -51,6 +55,7 @@ class ImageDataModule(LightningDataModule):
         val_fraction: float = 0.1,
         batch_size: int = 64,
         eval_batch_size: int = 256,
+        feature_pool: int | None = None,
         cache_dir: str | None = None,
         workers: int | None = None,
         room_seed: int = 0,
@@ -66,6 +71,8 @@ class ImageDataModule(LightningDataModule):
         self.val_fraction = val_fraction
         self.batch_size = batch_size
         self.eval_batch_size = eval_batch_size
+        self.feature_pool = feature_pool
+        self._pool = None if feature_pool is None else _pooled(extractor, feature_pool)
         self.cache_dir = cache_dir
         self.workers = workers
         self.room_seed = room_seed
@@ -101,19 +108,24 @@ class ImageDataModule(LightningDataModule):
     def dataset(self, split: str) -> PoseDataset:
         """One of `train`, `val`, `test`, its features in memory."""
         if split not in self._datasets:
-            frames = [self.scene.frames[i] for i in self.scene.splits[split]]
-            self._datasets[split] = PoseDataset(
-                PoseBatch(
-                    features=torch.from_numpy(self.cache.features([frame.image for frame in frames])),
-                    position_m=_stack([frame.position_m for frame in frames], 3),
-                    quat_wxyz=_stack([frame.quat_wxyz for frame in frames], 4),
-                    frame=torch.as_tensor(self.scene.splits[split], dtype=torch.int64),
-                )
-            )
+            self._datasets[split] = PoseDataset(self._read(split, self.cache))
         return self._datasets[split]
 
+    def _read(self, split: str, cache: FeatureCache) -> PoseBatch:
+        frames = [self.scene.frames[i] for i in self.scene.splits[split]]
+        return PoseBatch(
+            features=torch.from_numpy(cache.features([frame.image for frame in frames], workers=self.workers)),
+            position_m=_stack([frame.position_m for frame in frames], 3),
+            quat_wxyz=_stack([frame.quat_wxyz for frame in frames], 4),
+            frame=torch.as_tensor(self.scene.splits[split], dtype=torch.int64),
+        )
+
     def train_dataloader(self) -> DataLoader[PoseBatch]:
-        return batch_loader(self.dataset("train"), self.batch_size, shuffle=True)
+        train = self.dataset("train")
+        if self._pool is not None:
+            pool = self._read("train", FeatureCache(self._pool, self.cache_dir))
+            train = DrawnDataset(pool, self.input_shape[0])
+        return batch_loader(train, self.batch_size, shuffle=True)
 
     def val_dataloader(self) -> DataLoader[PoseBatch] | list[Any]:
         if len(self.scene.splits["val"]):
@@ -137,6 +149,19 @@ class ImageDataModule(LightningDataModule):
         spec = describe(self)
         spec["init_args"]["extractor"] = describe(self.extractor)
         return spec
+
+
+def _pooled(extractor: FeatureExtractor, feature_pool: int) -> LocalExtractor:
+    """The extractor with `feature_pool` features a frame, out of the same cache."""
+    if not isinstance(extractor, LocalExtractor):
+        raise ConfigError(f"data.feature_pool needs local features, and {extractor.name} has none; leave it out")
+    if not extractor.n_features <= feature_pool <= extractor.n_stored:
+        raise ConfigError(
+            f"data.feature_pool is {feature_pool}; give {extractor.n_features} (n_features) to {extractor.n_stored}"
+        )
+    pooled = copy(extractor)
+    pooled.n_features = feature_pool
+    return pooled
 
 
 def _stack(rows: list[np.ndarray], width: int) -> torch.Tensor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from lightning_pose.data.batches import PoseBatch, PoseDataset, batch_loader
+from lightning_pose.data.batches import DrawnDataset, PoseBatch, PoseDataset, batch_loader
 
 
 def dataset(count: int = 10) -> PoseDataset:
@@ -38,3 +38,16 @@ def test_a_shuffled_loader_has_every_frame_once_and_its_own_pose() -> None:
     assert sorted(frame.tolist()) == list(range(100, 110))
     position_m = torch.cat([batch.position_m for batch in batches])
     torch.testing.assert_close(position_m[:, 0], (frame - 100).float())
+
+
+def test_a_draw_takes_other_features_each_time_in_their_order() -> None:
+    torch.manual_seed(0)
+    row = torch.arange(20).float()
+    features = (100 * torch.arange(4)[:, None] + row)[..., None].expand(4, 20, 3)  # frame * 100 + row, in 3 columns
+    data = DrawnDataset(PoseBatch(features, torch.zeros(4, 3), torch.zeros(4, 4), torch.arange(4)), n_features=5)
+    first, second = data.__getitems__([2, 0]), data.__getitems__([2, 0])
+    assert first.features.shape == (2, 5, 3)
+    assert torch.all(first.features.diff(dim=1) > 0)
+    assert (first.features[:, :, 0] // 100).unique(dim=1).flatten().tolist() == [2, 0]
+    assert not torch.equal(first.features, second.features)
+    assert data[3].features.shape == (5, 3)

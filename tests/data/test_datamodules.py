@@ -15,6 +15,7 @@ import torch
 from lightning_pose.data import datamodules
 from lightning_pose.data.datamodules import ImageDataModule
 from lightning_pose.errors import ConfigError, DataError, ImageError
+from lightning_pose.features import ORB
 from lightning_pose.images import read_gray
 from lightning_pose.spec import build
 from tests.helpers import Thumbnails
@@ -58,6 +59,28 @@ def test_loaders(scene: Path) -> None:
     test = torch.cat([batch.frame for batch in data.test_dataloader()])
     assert test.tolist() == data.dataset("test").data.frame.tolist()
     assert torch.equal(test, torch.cat([batch.frame for batch in data.predict_dataloader()]))
+
+
+def test_a_feature_pool_is_drawn_from_in_training_only(scene: Path) -> None:
+    data = ImageDataModule(ORB(n_features=10), root=str(scene), feature_pool=40)
+    strongest = ImageDataModule(ORB(n_features=40), root=str(scene)).dataset("train").data
+    for batch in data.train_dataloader():
+        assert batch.features.shape[1:] == data.input_shape == (10, 256)
+        for frame, features in zip(batch.frame, batch.features, strict=True):
+            pool = strongest.features[strongest.frame == frame][0]
+            assert all((pool == row).all(dim=1).any() for row in features)
+    torch.testing.assert_close(data.dataset("train").data.features, strongest.features[:, :10])
+
+
+@pytest.mark.parametrize("pool", [9, 301])
+def test_a_feature_pool_out_of_range_is_refused(pool: int, scene: Path) -> None:
+    with pytest.raises(ConfigError, match=rf"data.feature_pool is {pool}; give 10 \(n_features\) to 300"):
+        ImageDataModule(ORB(n_features=10), root=str(scene), feature_pool=pool)
+
+
+def test_a_feature_pool_needs_local_features(scene: Path) -> None:
+    with pytest.raises(ConfigError, match=r"data.feature_pool needs local features, and thumbnails has none; leave"):
+        module(scene, feature_pool=40)
 
 
 def test_no_validation_frames_is_no_loader(scene: Path) -> None:
