@@ -199,7 +199,7 @@ def test_features_of_another_width(
     wider = ["--data.extractor.columns", "10", "--ckpt_path", trained.last]
     assert workplace.run(verb, "--trainer.max_epochs", "3", *wider) == 2
     line = capsys.readouterr().err.splitlines()[-1]
-    assert re.search(r"\(32, 8\) in the checkpoint and \(32, 10\) here; .*data.extractor", line), line
+    assert re.search(r"\(1, 8\) in the checkpoint and \(1, 10\) here; .*data.extractor", line), line
 
 
 def test_no_validation_frames(complaint: Complaint, trained: Trained) -> None:
