@@ -61,6 +61,9 @@ class Backbone(nn.Module):
         name: a key of `BACKBONES`.
     """
 
+    mean: Tensor
+    std: Tensor
+
     def __init__(self, name: str) -> None:
         super().__init__()
         recipe = BACKBONES[name]
