@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from typing import Any
 
 import torch
@@ -36,12 +37,16 @@ class GraphConvolution(nn.Module):
 
         name = _SHORT_NAMES.get(conv, conv)
         self.is_gcn = name == "GCNConv"
-        # A neighbour's degree is not known here, so that GCN gets its weights from us.
-        options: dict[str, Any] = {"normalize": False} if self.is_gcn else {}
-        if aggr is not None:
-            options["aggr"] = aggr
+        options: dict[str, Any] = {} if aggr is None else {"aggr": aggr}
         try:
-            self.layer: nn.Module = getattr(pyg, name)(in_width, out_width, **options)
+            kind: type[nn.Module] = getattr(pyg, name)
+            # PyG would join a target to the source of the same number, which is another node: loops are ours.
+            self.has_loops = "add_self_loops" in inspect.signature(kind).parameters
+            if self.has_loops:
+                options["add_self_loops"] = False
+            if self.is_gcn:
+                options["normalize"] = False  # it would need the degrees of sources, which nobody knows here
+            self.layer = kind(in_width, out_width, **options)
             with torch.no_grad():
                 shape = self(torch.zeros(1, in_width), torch.zeros(2, in_width), torch.tensor([[0, 1], [0, 0]])).shape
         except (AttributeError, TypeError, ValueError, RuntimeError, AssertionError) as error:
@@ -63,15 +68,17 @@ class GraphConvolution(nn.Module):
         Returns:
             (B, out_width), without an activation.
         """
-        if not self.is_gcn:
+        if not self.has_loops:
             return self.layer((source, target), edges)
-        # Every node hears equally many, so GCN's D^-1/2 (A + I) D^-1/2 is the mean over a node and its neighbours.
         B = len(target)
         itself = torch.arange(B, device=target.device)
         nodes, first = (target, 0) if source is target else (torch.cat([target, source]), B)
-        into = torch.cat([edges[1], itself])
-        weight = 1 / torch.bincount(into, minlength=B)[into].to(target.dtype)
-        return self.layer(nodes, torch.stack([torch.cat([edges[0] + first, itself]), into]), weight)[:B]
+        edges = torch.stack([torch.cat([edges[0] + first, itself]), torch.cat([edges[1], itself])])
+        if not self.is_gcn:
+            return self.layer(nodes, edges)[:B]
+        # Every node hears equally many, so GCN's D^-1/2 (A + I) D^-1/2 is the mean over a node and its neighbours.
+        weight = 1 / edges[1].bincount(minlength=B)[edges[1]].to(nodes.dtype)
+        return self.layer(nodes, edges, weight)[:B]
 
 
 class PoseHeads(nn.Module):

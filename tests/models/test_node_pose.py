@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
-from torch_geometric.nn import GCNConv, GraphConv
+from torch_geometric.nn import GATConv, GCNConv, GraphConv
 
 from lightning_pose.data.batches import PoseBatch
 from lightning_pose.data.graph import edge_index, search_neighbours
@@ -17,7 +17,7 @@ from lightning_pose.models import NodePose
 from tests.models.helpers import random_poses
 
 WIDTH = 16
-CONVOLUTIONS = ["wl", "gcn", "SAGEConv", "GATConv"]
+CONVOLUTIONS = ["wl", "gcn", "SAGEConv", "GATConv", "GATv2Conv", "TransformerConv"]
 
 
 def frames(count: int, seed: int = 0) -> PoseBatch:
@@ -60,7 +60,7 @@ def test_queries_never_hear_each_other() -> None:
         assert gradient.any(1).nonzero().flatten().tolist() == [row]
 
 
-@pytest.mark.parametrize(("conv", "layer"), [("wl", GraphConv), ("gcn", GCNConv)])
+@pytest.mark.parametrize(("conv", "layer"), [("wl", GraphConv), ("gcn", GCNConv), ("GATConv", GATConv)])
 def test_it_equals_pyg_on_the_joint_graph_of_training_images_and_queries(conv: str, layer: type) -> None:
     model = make(conv=conv)
     queries = frames(5, seed=1).features
