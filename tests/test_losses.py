@@ -45,12 +45,8 @@ def clip_loss(**settings: Any) -> dict[str, torch.Tensor]:
             2.5 + 10 * math.sqrt(2 - math.sqrt(2)) / 2,
             id="eq. 5.3",
         ),
-        pytest.param(
-            {"form": "split", "norm": "squared", "orientation_weight": 200}, 12.5 + 200 * 2.5, id="eq. 6.3"
-        ),
-        pytest.param(
-            {"form": "split", "learned_weights": True}, 2.5 + 1.5 * math.exp(3) - 3, id="learned weights"
-        ),
+        pytest.param({"form": "split", "norm": "squared", "orientation_weight": 200}, 12.5 + 200 * 2.5, id="eq. 6.3"),
+        pytest.param({"form": "split", "learned_weights": True}, 2.5 + 1.5 * math.exp(3) - 3, id="learned weights"),
     ],
 )
 def test_total_by_hand(settings: dict[str, Any], total: float) -> None:
