@@ -5,6 +5,8 @@ MLflow runs this file when it loads the model, which is safer than a pickle: the
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pandas as pd
 from mlflow.models import set_model
@@ -23,19 +25,18 @@ class LocalizerModel(PythonModel):
     def load_context(self, context: PythonModelContext) -> None:
         self.localizer = Localizer.from_checkpoint(context.artifacts["checkpoint"])
 
-    def predict(self, context, model_input, params=None):  # no type hints: MLflow would validate by them
+    def predict(self, context: Any, model_input: list[str], params: dict[str, Any] | None = None) -> pd.DataFrame:
         """Locate images.
 
         Args:
             context: MLflow's.
-            model_input: image files, as a list or as the first column of a table.
+            model_input: image files; MLflow makes this list of a table with one column, too.
             params: none are used.
 
         Returns:
             One row an image: camera centre in metres and camera-to-world quaternion.
         """
-        images = model_input.iloc[:, 0] if isinstance(model_input, pd.DataFrame) else model_input
-        return pd.DataFrame(np.hstack(self.localizer(list(images))), columns=pd.Index(COLUMNS))
+        return pd.DataFrame(np.hstack(self.localizer(model_input)), columns=pd.Index(COLUMNS))
 
 
 set_model(LocalizerModel())

@@ -181,7 +181,8 @@ def log_localizer(logger: MLflowLogger, checkpoint: Path) -> None:
     logging.getLogger("mlflow.utils.environment").setLevel(logging.ERROR)  # it misses pip, which uv does without
     mlflow.set_tracking_uri(logger.uri)
     with mlflow.start_run(run_id=str(logger.run_id)), warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # the model takes files, for which MLflow has no schema
+        # The model takes files, for which MLflow has no schema; it warns of that in its own way.
+        warnings.simplefilter("ignore", UserWarning)
         mlflow.pyfunc.log_model(
             name="model",
             python_model=str(Path(__file__).with_name("pyfunc.py")),
