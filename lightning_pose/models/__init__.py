@@ -1,7 +1,11 @@
 """The architectures, one file each; `base` says how to add another."""
 
 from lightning_pose.models.base import Pose, PoseModule
+from lightning_pose.models.dense_posenet import DensePoseNet
+from lightning_pose.models.graph_pose import GraphPose
+from lightning_pose.models.linear_posenet import LinearPoseNet
+from lightning_pose.models.node_pose import NodePose
 from lightning_pose.models.surf_cnn import SurfCNN
 from lightning_pose.models.surf_lstm import SurfLSTM
 
-__all__ = ["Pose", "PoseModule", "SurfCNN", "SurfLSTM"]
+__all__ = ["DensePoseNet", "GraphPose", "LinearPoseNet", "NodePose", "Pose", "PoseModule", "SurfCNN", "SurfLSTM"]

@@ -1,0 +1,178 @@
+"""Ridge regression and principal components in closed form, from one pass over frames of any number."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lightning_pose.errors import ConfigError
+
+__all__ = ["Moments", "Ridge", "Spectrum"]
+
+_BLOCKS = 8  # of the Gram matrix's columns: the upper triangle takes 36 of 64 products
+
+
+class Ridge(NamedTuple):
+    """A linear map with bias, `targets = features @ weight.T + bias`, in float64.
+
+    Attributes:
+        weight: (T, D).
+        bias: (T,).
+        coefficients: (T, K) of the K principal components that `weight` is folded from; `weight` itself where
+            all features are used.
+    """
+
+    weight: Tensor
+    bias: Tensor
+    coefficients: Tensor
+
+
+class Spectrum(NamedTuple):
+    """Principal components of features, in float64, without the null space.
+
+    Attributes:
+        values: (R,) eigenvalues of the centred Gram matrix, largest first.
+        vectors: (D, R) its eigenvectors.
+        mean: (D,) mean features.
+    """
+
+    values: Tensor
+    vectors: Tensor
+    mean: Tensor
+
+    def first(self, components: int) -> Spectrum:
+        """The first K of them.
+
+        Raises:
+            ConfigError: there are fewer than K.
+        """
+        if components > len(self.values):
+            raise ConfigError(
+                f"components is {components}, but the training features have only {len(self.values)} principal "
+                "components; give fewer, or more training frames"
+            )
+        return Spectrum(self.values[:components], self.vectors[:, :components], self.mean)
+
+
+class Moments:
+    """Count, means and centred second moments of features (D) and targets (T), in float64, from a stream of frames.
+
+    Memory is of the order of D x D, however many frames come. Up to D frames are kept as they are: for so few, the
+    products of frames are a smaller problem than those of features. More are folded into the features' Gram matrix,
+    around their own mean (Chan, Golub & LeVeque 1983), so that large offsets cost no digits.
+
+    Args:
+        n_features: D.
+        n_targets: T; 0 serves where only principal components are wanted.
+    """
+
+    def __init__(self, n_features: int, n_targets: int = 0) -> None:
+        self._sizes = [n_features, n_targets]
+        self._rows: list[Tensor] = []  # (B, D + T) each, not yet folded
+        self._n_rows = 0
+        self._n_folded = 0
+        self._mean = self._gram = self._cross = torch.empty(0)  # of the folded; of the Gram, the upper triangle
+
+    @property
+    def count(self) -> int:
+        """Frames so far."""
+        return self._n_folded + self._n_rows
+
+    def add(self, x: Tensor, y: Tensor) -> None:
+        """Take features (B, D) and targets (B, T) of further frames."""
+        self._rows.append(torch.cat([x, y], dim=1))
+        self._n_rows += len(x)
+        if self._n_rows > self._sizes[0]:
+            self._fold()
+
+    def all_reduce(self, total: Callable[[Tensor], Tensor]) -> None:
+        """Join what several processes took, each at least one frame; `total` sums a tensor over all of them."""
+        self._fold()
+        count = total(self._mean.new_tensor([self._n_folded]))
+        mean = total(self._mean * self._n_folded) / count
+        self._add_moments(self._mean - mean, self._n_folded)
+        self._gram, self._cross = total(self._gram), total(self._cross)
+        self._mean, self._n_folded = mean, int(count)
+
+    def ridge(self, lambdas: Sequence[float], components: int | None = None) -> list[Ridge]:
+        """Minimise |Y - X W|^2 + lambda |W|^2 (thesis, eq. 5.2) for each lambda; the bias is not penalised.
+
+        One eigendecomposition serves all lambdas and the principal components. A single lambda on all features of
+        many frames takes a Cholesky factorisation, a tenth of its time.
+
+        Args:
+            lambdas: each above 0.
+            components: regress on so many principal components (eq. 5.4) instead of all features.
+
+        Raises:
+            ConfigError: there are fewer components.
+        """
+        mean, cross = self._mean_and_cross()
+        if self._n_folded and components is None and len(lambdas) == 1:
+            self._gram.diagonal().add_(lambdas[0])
+            factor = torch.linalg.cholesky(self._gram, upper=True)
+            self._gram.diagonal().sub_(lambdas[0])
+            coefficients, basis = [torch.cholesky_solve(cross, factor, upper=True).T], None
+        else:
+            values, basis, _ = self.spectrum() if components is None else self.spectrum().first(components)
+            projected = basis.T @ cross
+            coefficients = [(projected / (values + strength)[:, None]).T for strength in lambdas]
+        mean_x, mean_y = mean.split(self._sizes)
+        answers = []
+        for own in coefficients:
+            weight = own if basis is None else own @ basis.T
+            answers.append(Ridge(weight, mean_y - weight @ mean_x, weight if components is None else own))
+        return answers
+
+    def spectrum(self) -> Spectrum:
+        """The principal components of the features, with their sums of squares."""
+        if self._n_folded:
+            self._fold()
+            mean = self._mean
+            values, vectors = torch.linalg.eigh(self._gram, UPLO="U")
+        else:
+            mean, x, _ = self._centred_rows()
+            values, vectors = torch.linalg.eigh(x @ x.T)
+            # Eigenvectors over frames span those over features, but for what the null space would divide by 0.
+            vectors = x.T @ (vectors / values.clamp(min=torch.finfo(values.dtype).tiny).sqrt())
+        kept = values > values[-1] * len(values) * torch.finfo(values.dtype).eps
+        return Spectrum(values[kept].flip(0), vectors[:, kept].flip(1), mean[: self._sizes[0]])
+
+    def _mean_and_cross(self) -> tuple[Tensor, Tensor]:
+        if self._n_folded:
+            self._fold()
+            return self._mean, self._cross
+        mean, x, y = self._centred_rows()
+        return mean, x.T @ y
+
+    def _centred_rows(self) -> tuple[Tensor, Tensor, Tensor]:
+        rows = torch.cat(self._rows).double()
+        mean = rows.mean(0)
+        x, y = rows.sub_(mean).split(self._sizes, dim=1)
+        return mean, x, y
+
+    def _fold(self) -> None:
+        if not self._n_rows:
+            return
+        mean, x, y = self._centred_rows()
+        features = self._sizes[0]
+        if not self._n_folded:
+            self._mean = torch.zeros_like(mean)
+            self._gram, self._cross = mean.new_zeros(features, features), mean.new_zeros(self._sizes)
+        width = -(-features // _BLOCKS)
+        for i in range(0, features, width):
+            self._gram[i : i + width, i:].addmm_(x[:, i : i + width].T, x[:, i:])
+        self._cross.addmm_(x.T, y)
+        shift, count = mean - self._mean, self.count
+        self._add_moments(shift, self._n_folded * self._n_rows / count)
+        self._mean = self._mean + shift * (self._n_rows / count)
+        self._rows, self._n_folded, self._n_rows = [], count, 0
+
+    def _add_moments(self, shift: Tensor, weight: float) -> None:
+        """Add `weight` frames that lie `shift` off the mean."""
+        x, y = shift.split(self._sizes)
+        self._gram.addr_(x, x, alpha=weight)
+        self._cross.addr_(x, y, alpha=weight)

@@ -1,0 +1,57 @@
+"""DensePoseNet: the thesis's sizes, its principal components, and its refusals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from lightning import Trainer
+from sklearn.decomposition import PCA
+
+from lightning_pose.errors import ConfigError
+from lightning_pose.models import DensePoseNet
+from tests.models.helpers import LearnableProblem
+
+
+@pytest.mark.parametrize(("components", "count"), [(None, 566_151), (280, 113_543)])
+def test_the_thesis_counts_its_parameters(components: int | None, count: int) -> None:
+    network = DensePoseNet(input_shape=[2048], components=components).network
+    assert sum(parameter.numel() for parameter in network.parameters()) == count
+
+
+def test_it_reads_principal_components_of_the_training_features() -> None:
+    problem = LearnableProblem([32])
+    model = DensePoseNet(input_shape=[32], components=4, standardize_features=False)
+    trainer = Trainer(max_epochs=1, accelerator="cpu", logger=False, enable_checkpointing=False,
+                      enable_progress_bar=False, enable_model_summary=False)  # fmt: skip
+    trainer.fit(model, datamodule=problem)
+    features = problem.data.data.features
+    ours = model.network[0](features).double().numpy()  # type: ignore[index]
+    theirs = PCA(4, svd_solver="full").fit_transform(features.double().numpy())
+    assert np.square(ours).mean() == pytest.approx(1, rel=1e-5)
+    theirs *= np.sign((ours * theirs).sum(0)) / np.sqrt(np.square(theirs).mean())
+    np.testing.assert_allclose(ours, theirs, atol=1e-5)
+    assert not any("components" in name for name, _ in model.named_parameters()), "they are not trained"
+    rebuilt = DensePoseNet(input_shape=[32], components=4, standardize_features=False)
+    rebuilt.load_state_dict(model.state_dict())
+    torch.testing.assert_close(rebuilt.eval()(features), model.eval()(features))
+
+
+def test_headline_names_what_differs() -> None:
+    assert DensePoseNet(input_shape=[32]).headline == "32"
+    assert DensePoseNet(input_shape=[32], components=8).headline == "32 K=8"
+
+
+def test_more_components_than_there_are_is_refused() -> None:
+    model = DensePoseNet(input_shape=[32], components=30)
+    with pytest.raises(ConfigError, match="components is 30, but the training features have only 7 principal"):
+        Trainer(accelerator="cpu", logger=False, enable_checkpointing=False).fit(
+            model, datamodule=LearnableProblem([32])
+        )
+
+
+def test_sizes_out_of_range_are_refused() -> None:
+    with pytest.raises(ConfigError, match=r"units is \[\]; give the width of one layer or more"):
+        DensePoseNet(input_shape=[32], units=[])
+    with pytest.raises(ConfigError, match="components is 0; give 1 or more"):
+        DensePoseNet(input_shape=[32], components=0)
