@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from itertools import pairwise
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -28,9 +29,14 @@ class NodePose(PoseModule):
     and the training images' states, computed once, serve them all. The training images' features are part of the
     checkpoint.
 
-    The thesis's form is the one of the default arguments: nodes carry features only. With `neighbour_poses` they
-    know where they are: the last convolution also hears the neighbours' poses, and the answer is a correction of
-    their mean. A node's own pose enters nowhere on the way to its own answer.
+    The thesis's form has `neighbour_poses: 0`: what a node learns of its neighbours are features. But they are posed,
+    and a new image is nearer to its neighbours than any regression of its pose is: so here the network's errors on
+    the nearest neighbours correct its answer, as in Correct and Smooth (Huang et al., ICLR 2021). The answer is
+
+        mean over the neighbours j of (pose_j + slope * (network(query) - network(j))),
+
+    image retrieval for a slope of 0, the network with its neighbours' errors taken off for 1. It is trained as the
+    thesis's is, so that no node sees its own pose.
 
     Args:
         neighbours: K.
@@ -39,10 +45,10 @@ class NodePose(PoseModule):
         channels: width of each convolution.
         dropout: before each convolution.
         normalize: search neighbours by L2 between features of unit length, as image retrieval does.
-        neighbour_poses: let nodes know their neighbours' poses.
-        gap: training images are joined only if at least this many frames lie between their places in the scene. 1 is
-            the thesis's. Neighbours in a video are closer than those of a new image will ever be, and a network
-            that learns from these relies on them too much.
+        neighbour_poses: how many of the nearest neighbours correct the answer by their own poses; 0 for none.
+        slope: see above.
+        gap: training images are joined only if their places in the scene are at least this many frames apart; 1
+            joins all, as the thesis does.
         full_graph_limit: up to this many training images every step computes the whole graph; with more, the part
             that the batch depends on, with `fanout` neighbours of each node drawn at random.
         fanout: see above.
@@ -66,7 +72,8 @@ class NodePose(PoseModule):
         channels: list[int] = [256, 128, 64],  # noqa: B006  (never changed; shown as it is in --help)
         dropout: float = 0.0,
         normalize: bool = True,
-        neighbour_poses: bool = False,
+        neighbour_poses: int = 1,
+        slope: float = 0.5,
         gap: int = 1,
         full_graph_limit: int = 10_000,
         fanout: int = 10,
@@ -78,18 +85,24 @@ class NodePose(PoseModule):
                 raise ConfigError(f"{name} is {value}; give 1 or more")
         if not channels or not 0 <= dropout < 1:
             raise ConfigError(f"channels are {channels} and dropout is {dropout}; give widths, and 0 to below 1")
+        if not 0 <= neighbour_poses <= neighbours:
+            raise ConfigError(
+                f"neighbour_poses is {neighbour_poses} and neighbours is {neighbours}; give 0 to as many as neighbours"
+            )
         self.neighbours = neighbours
+        self.neighbour_poses = neighbour_poses
+        self.slope = slope
         self.normalize = normalize
         self.gap = gap
         self.full_graph_limit = full_graph_limit
         self.fanout = fanout
-        self.network = _NodeNetwork(self.input_shape[0], conv, aggr, channels, dropout, neighbour_poses)
+        self.network = _NodeNetwork([self.input_shape[0], *channels], conv, aggr, dropout)
         # Their length is the training split's; `_make_room` gives them a checkpoint's.
         self.register_buffer("memory_features", torch.zeros(0, *self.input_shape))
         self.register_buffer("memory_pose", torch.zeros(0, 7))
         self.register_buffer("memory_frame", torch.zeros(0, dtype=torch.int64))
         self.register_buffer("memory_table", torch.zeros(0, neighbours, dtype=torch.int64))
-        self._states: tuple[Tensor, list[Tensor]] | None = None
+        self._memory: _Memory | None = None
 
     @property
     def headline(self) -> str:
@@ -109,43 +122,48 @@ class NodePose(PoseModule):
         self.memory_frame = train.frame
         keys = self._key(train.features)
         self.memory_table = search_neighbours(keys, keys, self.neighbours, train.frame, train.frame, self.gap)
-        self._states = None
+        self._memory = None
 
     def _decode(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        keys, states = self._remembered()
-        table = search_neighbours(self._key(features), keys, self.neighbours)
+        memory = self._remembered()
+        table = search_neighbours(self._key(features), memory.keys, self.neighbours)
         target = self._standardized(features)
-        for layer, source in enumerate(states[:-1]):
-            target = self.network.hidden(layer, target, source, table)
-        return self._unscaled(self.network.answer(target, states[-1], table, self.memory_pose))
+        for layer, source in enumerate(memory.states):
+            target = self.network.hear(layer, target, source, table)
+        pose = self.network.heads(target)
+        if self.neighbour_poses:
+            pose = self.slope * pose + _mean_of_neighbours(memory.offset, table[:, : self.neighbour_poses])
+        return self._unscaled(pose)
 
     def _decode_batch(self, batch: PoseBatch) -> tuple[Tensor, Tensor]:
         if not self.training:
             return self._decode(batch.features)
-        self._states = None  # weights are about to change
+        self._memory = None  # weights are about to change
         rows, table = torch.searchsorted(self.memory_frame, batch.frame), self.memory_table
-        features, pose = self.memory_features, self.memory_pose
+        features = self.memory_features
         if len(table) > self.full_graph_limit:
             table = sample_neighbours(table, self.fanout)
             nodes, table, rows = neighbourhood(table, rows, hops=len(self.network.convolutions))
-            features, pose = features[nodes], pose[nodes]
-        state = self.network.states(self._standardized(features), table)[-1]
-        return self._unscaled(self.network.answer(state[rows], state, table[rows], pose))
+            features = features[nodes]
+        *_, last = self.network.states(self._standardized(features), table)
+        answer = self.network.hear(len(self.network.convolutions) - 1, last[rows], last, table[rows])
+        return self._unscaled(self.network.heads(answer))
 
-    def _remembered(self) -> tuple[Tensor, list[Tensor]]:
-        """What queries are compared with, and what they hear at each convolution; computed when first needed."""
-        if self._states is None or self._states[0].device != self.device:
+    def _remembered(self) -> _Memory:
+        """What queries are compared with and what they hear; computed when first needed."""
+        if self._memory is None or self._memory.keys.device != self.device:
             with torch.inference_mode(False), torch.no_grad():
-                features = self.memory_features
-                states = self.network.states(self._standardized(features), self.memory_table)
-                self._states = self._key(features), states
-        return self._states
+                states = self.network.states(self._standardized(self.memory_features), self.memory_table)
+                answer = self.network.heads(self.network.hear_all(len(states) - 1, states[-1], self.memory_table))
+                offset = self.memory_pose - self.slope * answer
+                self._memory = _Memory(self._key(self.memory_features), states, offset)
+        return self._memory
 
     def _key(self, features: Tensor) -> Tensor:
         return F.normalize(features, dim=-1) if self.normalize else features
 
     def train(self, mode: bool = True) -> NodePose:
-        self._states = None
+        self._memory = None
         return super().train(mode)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -158,55 +176,51 @@ class NodePose(PoseModule):
 
     def _make_room(self, state_dict: dict[str, Tensor]) -> None:
         """Let the memory be as long as the checkpoint's; other differences in shape are left to be refused."""
-        self._states = None
+        self._memory = None
         for name in _MEMORY:
             if name in state_dict:
                 buffer = getattr(self, name)
                 setattr(self, name, buffer.new_zeros(len(state_dict[name]), *buffer.shape[1:]))
 
 
+class _Memory(NamedTuple):
+    """What N training images are to a query: `keys` (N, D) it is compared with, `states` (N, C) that each convolution
+    hears, and `offset` (N, 7), the scaled pose less the slope's part of the network's answer."""
+
+    keys: Tensor
+    states: list[Tensor]
+    offset: Tensor
+
+
 class _NodeNetwork(nn.Module):
-    def __init__(
-        self, width: int, conv: str, aggr: str | None, channels: list[int], dropout: float, neighbour_poses: bool
-    ) -> None:
+    def __init__(self, widths: list[int], conv: str, aggr: str | None, dropout: float) -> None:
         super().__init__()
-        self.neighbour_poses = neighbour_poses
-        widths = [width, *channels]
-        widths_in = widths[:-1]
-        widths_in[-1] += 8 if neighbour_poses else 0  # a pose, and a flag that says that there is one
-        self.convolutions = nn.ModuleList(
-            GraphConvolution(conv, before, after, aggr) for before, after in zip(widths_in, channels, strict=True)
-        )
+        self.convolutions = nn.ModuleList(GraphConvolution(conv, *pair, aggr) for pair in pairwise(widths))
         self.dropout = nn.Dropout(dropout)
-        self.heads = PoseHeads(channels[-1])
+        self.heads = PoseHeads(widths[-1])
 
     def states(self, features: Tensor, table: Tensor) -> list[Tensor]:
-        """What each convolution reads of N nodes, (N, D) features first, for their graph (N, K)."""
+        """What each convolution reads of N nodes, their (N, D) features first, for their graph (N, K)."""
         states = [features]
         for layer in range(len(self.convolutions) - 1):
-            parts = zip(states[-1].split(_CHUNK), table.split(_CHUNK), strict=True)
-            states.append(torch.cat([self.hidden(layer, target, states[-1], rows) for target, rows in parts]))
+            states.append(self.hear_all(layer, states[-1], table))
         return states
 
-    def hidden(self, layer: int, target: Tensor, source: Tensor, table: Tensor) -> Tensor:
+    def hear_all(self, layer: int, state: Tensor, table: Tensor) -> Tensor:
+        """One convolution over all N nodes of a graph, some at a time."""
+        parts = zip(state.split(_CHUNK), table.split(_CHUNK), strict=True)
+        return torch.cat([self.hear(layer, target, state, rows) for target, rows in parts])
+
+    def hear(self, layer: int, target: Tensor, source: Tensor, table: Tensor) -> Tensor:
         """(B, C) states of targets after a convolution over the (M, C) sources that `table` (B, K) joins them to."""
         source_row, target_row = edge_index(table)
         heard, source_row = source_row.unique(return_inverse=True)
         target, source = self.dropout(target), self.dropout(source[heard])
         return self.convolutions[layer](target, source, torch.stack([source_row, target_row])).relu()
 
-    def answer(self, target: Tensor, source: Tensor, table: Tensor, pose: Tensor) -> Tensor:
-        """The last convolution and the heads: (B, 7) scaled poses; `pose` (M, 7) is where the sources are."""
-        last = len(self.convolutions) - 1
-        if not self.neighbour_poses:
-            return self.heads(self.hidden(last, target, source, table))
-        target = torch.cat([target, target.new_zeros(len(target), 8)], dim=1)
-        source = torch.cat([source, pose, pose.new_ones(len(pose), 1)], dim=1)
-        return self.heads(self.hidden(last, target, source, table)) + _mean_of_neighbours(pose, table)
 
-
-def _mean_of_neighbours(pose: Tensor, table: Tensor) -> Tensor:
-    """(B, 7) mean of the (M, 7) poses that `table` (B, K) joins each row to; zero, the mean of all, where none."""
+def _mean_of_neighbours(rows: Tensor, table: Tensor) -> Tensor:
+    """(B, 7) mean of the rows of (M, 7) that `table` (B, K) joins each target to; zero where there are none."""
     source, target = edge_index(table)
     count = target.bincount(minlength=len(table)).clamp(min=1).unsqueeze(1)
-    return pose.new_zeros(len(table), 7).index_add(0, target, pose[source]) / count
+    return rows.new_zeros(len(table), 7).index_add(0, target, rows[source]) / count
