@@ -42,7 +42,8 @@ class CNN(FeatureExtractor):
         size: side of the square image that the network sees; by default the one it was trained with
             (224; 299 for inception_v3).
         crop: `center` cuts the square out of the middle, after the shorter side was resized to 256/224 of it,
-            as the networks were tested on ImageNet; `whole` squeezes the whole frame into it.
+            as the networks were tested on ImageNet; `whole` squeezes the whole frame into it, so that nothing is
+            lost, and maps have one shape whatever that of the images.
 
     Raises:
         ConfigError: an unknown backbone, output or crop, or a size too small for the network.
