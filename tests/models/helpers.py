@@ -14,7 +14,7 @@ from lightning_pose.models import PoseModule
 
 __all__ = ["ARCHITECTURES", "INPUT_SHAPES", "LearnableProblem", "make_model", "random_poses"]
 
-INPUT_SHAPES = {2: [20, 64]}
+INPUT_SHAPES = {1: [32], 2: [20, 64], 3: [16, 3, 4]}
 """A small input for each `input_rank`."""
 
 _exported = [getattr(models, name) for name in models.__all__]
@@ -26,7 +26,10 @@ ARCHITECTURES = [
 def make_model(architecture: type[PoseModule], **settings: object) -> PoseModule:
     """An architecture with its default settings, for a small input, the same weights each time."""
     torch.manual_seed(0)
-    return architecture(input_shape=INPUT_SHAPES[architecture.input_rank], **settings)  # type: ignore[arg-type]
+    model = architecture(input_shape=INPUT_SHAPES[architecture.input_rank], **settings)  # type: ignore[arg-type]
+    if isinstance(model, models.NodePose):
+        model.remember(LearnableProblem(list(model.input_shape)).data.data)
+    return model
 
 
 def random_poses(count: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
