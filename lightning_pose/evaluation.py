@@ -72,7 +72,14 @@ class TestReport(Callback):
         train, test = (datamodule.dataset(split).data for split in ("train", "test"))
         prediction = Pose(*(torch.cat(parts) for parts in zip(*self._poses, strict=True)))
         appearance = datamodule.extractor.appearance
-        baselines = evaluate_baselines(appearance(train.features), *train[1:3], appearance(test.features), *test[1:3])
+        baselines = evaluate_baselines(
+            appearance(train.features),
+            train.position_m,
+            train.quat_wxyz,
+            appearance(test.features),
+            test.position_m,
+            test.quat_wxyz,
+        )
         model = {
             name.removeprefix("test/"): float(value)
             for name, value in trainer.callback_metrics.items()

@@ -178,7 +178,8 @@ def log_localizer(logger: MLflowLogger, checkpoint: Path) -> None:
     import mlflow
 
     os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
-    logging.getLogger("mlflow.utils.environment").setLevel(logging.ERROR)  # it misses pip, which uv does without
+    for noisy in ("mlflow.utils.environment", "mlflow.models.signature"):  # uv has no pip; a table is no type hint
+        logging.getLogger(noisy).setLevel(logging.ERROR)
     mlflow.set_tracking_uri(logger.uri)
     with mlflow.start_run(run_id=str(logger.run_id)), warnings.catch_warnings():
         # The model takes files, for which MLflow has no schema; it warns of that in its own way.

@@ -147,6 +147,7 @@ class _FoldedLinear(nn.Module):
     components, 7 x D: the K x D components would make a file of megabytes, and say no more.
     """
 
+    bias: Tensor
     folded: Tensor | None
 
     def __init__(self, n_features: int, components: int | None) -> None:

@@ -59,6 +59,7 @@ class NodePose(PoseModule):
     """
 
     input_rank: ClassVar[int] = 1
+    network: _NodeNetwork
     memory_features: Tensor
     memory_pose: Tensor
     memory_frame: Tensor

@@ -1,4 +1,6 @@
 """NodePose: what queries hear, what they must not, the memory in its checkpoint, and its sizes."""
+# pyright: reportCallIssue=false, reportAttributeAccessIssue=false, reportIndexIssue=false
+# (torch types what modules hold as Tensor or Module, which layers here are known not to be)
 
 from __future__ import annotations
 
