@@ -78,7 +78,7 @@ def fitted(model: models.PoseModule, data: RandomData, epochs: int) -> float:
         Trainer(
             max_epochs=epochs + 1,
             accelerator="cpu",
-            logger=MLflowLogger(root=root),
+            logger=MLflowLogger(root=root, tracking_uri=f"sqlite:///{root}/mlflow.db"),
             callbacks=[RunRecorder(), Timer(), LastCheckpoint(), EpochBar(), BestCheckpoint(), clock],
             default_root_dir=root,
             enable_model_summary=False,
