@@ -143,7 +143,7 @@ def test_a_killed_process(workplace: Workplace) -> None:
     assert outcome[signal.SIGKILL][2] == ["RUNNING"]
     code, stderr, statuses = outcome[signal.SIGINT]
     assert code == 130
-    assert stderr.splitlines()[-1] == "interrupted"
+    assert stderr.splitlines()[-1] == "interrupted; `fit --ckpt_path last`, with the same settings, goes on"
     assert "Traceback" not in stderr
     assert statuses == ["KILLED", "KILLED"]
 
