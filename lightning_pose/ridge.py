@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -71,7 +72,7 @@ class Moments:
 
     def __init__(self, n_features: int, n_targets: int = 0) -> None:
         self._sizes = [n_features, n_targets]
-        self._rows: list[Tensor] = []  # (B, D + T) each, not yet folded
+        self._rows = torch.empty(0)  # (D + 1, D + T), of which the first `_n_rows` are not yet folded
         self._n_rows = 0
         self._n_folded = 0
         self._mean = self._gram = self._cross = torch.empty(0)  # of the folded; of the Gram, the upper triangle
@@ -83,18 +84,26 @@ class Moments:
 
     def add(self, x: Tensor, y: Tensor) -> None:
         """Take features (B, D) and targets (B, T) of further frames."""
-        self._rows.append(torch.cat([x, y], dim=1))
-        self._n_rows += len(x)
-        if self._n_rows > self._sizes[0]:
-            self._fold()
+        most = self._sizes[0]
+        if not self.count:
+            self._rows = x.new_empty(most + 1, sum(self._sizes), dtype=torch.float64)
+        rows = torch.cat([x, y], dim=1)
+        while len(rows):
+            if self._n_rows == most:
+                self._fold()
+            taken = rows[: most - self._n_rows]
+            self._rows[self._n_rows : self._n_rows + len(taken)] = taken
+            self._n_rows += len(taken)
+            rows = rows[len(taken) :]
 
     def all_reduce(self, total: Callable[[Tensor], Tensor]) -> None:
         """Join what several processes took, each at least one frame; `total` sums a tensor over all of them."""
         self._fold()
         count = total(self._mean.new_tensor([self._n_folded]))
         mean = total(self._mean * self._n_folded) / count
-        self._add_moments(self._mean - mean, self._n_folded)
-        self._gram, self._cross = total(self._gram), total(self._cross)
+        x, y = (self._mean - mean).split(self._sizes)
+        self._gram = total(self._gram.addr_(x, x, alpha=self._n_folded))
+        self._cross = total(self._cross.addr_(x, y, alpha=self._n_folded))
         self._mean, self._n_folded = mean, int(count)
 
     def ridge(self, lambdas: Sequence[float], components: int | None = None) -> list[Ridge]:
@@ -134,7 +143,9 @@ class Moments:
             mean = self._mean
             values, vectors = torch.linalg.eigh(self._gram, UPLO="U")
         else:
-            mean, x, _ = self._centred_rows()
+            rows = self._rows[: self._n_rows]
+            mean = rows.mean(0)
+            x = (rows - mean)[:, : self._sizes[0]]
             values, vectors = torch.linalg.eigh(x @ x.T)
             # Eigenvectors over frames span those over features, but for what the null space would divide by 0.
             vectors = x.T @ (vectors / values.clamp(min=torch.finfo(values.dtype).tiny).sqrt())
@@ -145,34 +156,27 @@ class Moments:
         if self._n_folded:
             self._fold()
             return self._mean, self._cross
-        mean, x, y = self._centred_rows()
-        return mean, x.T @ y
-
-    def _centred_rows(self) -> tuple[Tensor, Tensor, Tensor]:
-        rows = torch.cat(self._rows).double()
+        rows = self._rows[: self._n_rows]
         mean = rows.mean(0)
-        x, y = rows.sub_(mean).split(self._sizes, dim=1)
-        return mean, x, y
+        x, y = (rows - mean).split(self._sizes, dim=1)
+        return mean, x.T @ y
 
     def _fold(self) -> None:
         if not self._n_rows:
             return
-        mean, x, y = self._centred_rows()
-        features = self._sizes[0]
+        features, n, count = self._sizes[0], self._n_rows, self.count
+        mean = self._rows[:n].mean(0)
         if not self._n_folded:
             self._mean = torch.zeros_like(mean)
             self._gram, self._cross = mean.new_zeros(features, features), mean.new_zeros(self._sizes)
+        shift = mean - self._mean
+        self._rows[:n] -= mean
+        # One more row makes up for the difference between the two means.
+        self._rows[n] = shift * math.sqrt(self._n_folded * n / count)
+        x, y = self._rows[: n + 1].split(self._sizes, dim=1)
         width = -(-features // _BLOCKS)
         for i in range(0, features, width):
             self._gram[i : i + width, i:].addmm_(x[:, i : i + width].T, x[:, i:])
         self._cross.addmm_(x.T, y)
-        shift, count = mean - self._mean, self.count
-        self._add_moments(shift, self._n_folded * self._n_rows / count)
-        self._mean = self._mean + shift * (self._n_rows / count)
-        self._rows, self._n_folded, self._n_rows = [], count, 0
-
-    def _add_moments(self, shift: Tensor, weight: float) -> None:
-        """Add `weight` frames that lie `shift` off the mean."""
-        x, y = shift.split(self._sizes)
-        self._gram.addr_(x, x, alpha=weight)
-        self._cross.addr_(x, y, alpha=weight)
+        self._mean = self._mean + shift * (n / count)
+        self._n_folded, self._n_rows = count, 0
