@@ -16,7 +16,7 @@ class PoseBatch(NamedTuple):
     """Features and poses of B frames.
 
     Attributes:
-        features: (B, ...) float32, as the extractor shapes them.
+        features: (B, ...) as the extractor shapes them; float32, or uint8 for images.
         position_m: (B, 3) float32, camera centre in the world.
         quat_wxyz: (B, 4) float32, unit, camera-to-world.
         frame: (B,) int64, index of each frame in `Scene.frames`.

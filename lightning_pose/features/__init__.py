@@ -1,4 +1,4 @@
-"""Images -> features: SURF of our own, other descriptors through OpenCV, frozen CNNs, and the cache of all.
+"""Images -> features: SURF of our own, other descriptors through OpenCV, frozen CNNs, pixels, and their cache.
 
 `base` says how to add an extractor.
 """
@@ -7,6 +7,7 @@ from lightning_pose.features.base import FeatureExtractor, LocalExtractor
 from lightning_pose.features.cache import FeatureCache, FillReport
 from lightning_pose.features.classical import BRIEF, FREAK, ORB, SIFT
 from lightning_pose.features.cnn import CNN
+from lightning_pose.features.pixels import Pixels
 from lightning_pose.features.surf import SURF
 
 __all__ = [
@@ -20,4 +21,5 @@ __all__ = [
     "FeatureExtractor",
     "FillReport",
     "LocalExtractor",
+    "Pixels",
 ]

@@ -30,7 +30,7 @@ class FeatureExtractor(ABC):
     - `color`: whether `extract` wants `gray` (H, W) or `rgb` (H, W, 3) uint8 images;
     - `primary`: the name of the array that the networks read;
     - `settings`: everything that changes the stored arrays, in plain types (it keys the cache);
-    - `feature_shape`: the shape that `features` returns for one image;
+    - `feature_shape`: the shape that `features` returns for one image, and `dtype` if it is not float32;
     - `extract`: the work itself, deterministic, for images that may differ in size;
     - `features`: only where the networks do not read the stored primary array as it is.
 
@@ -39,6 +39,7 @@ class FeatureExtractor(ABC):
 
     color: ClassVar[Literal["gray", "rgb"]]
     primary: ClassVar[str]
+    dtype: ClassVar[type[np.generic]] = np.float32
 
     @property
     def name(self) -> str:
@@ -68,7 +69,7 @@ class FeatureExtractor(ABC):
         """Compute one record per image."""
 
     def features(self, record: Record) -> np.ndarray:
-        """What the networks read, out of one stored record: float32 of `feature_shape`."""
+        """What the networks read, out of one stored record: of `feature_shape` and `dtype`."""
         return record[self.primary]
 
     def appearance(self, features: Tensor) -> Tensor:

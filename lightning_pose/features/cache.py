@@ -100,8 +100,8 @@ class FeatureCache:
         return self._visit(paths, lambda numbers, record: None, workers, progress)
 
     def features(self, paths: Sequence[ImagePath], workers: int | None = None, progress: bool = True) -> np.ndarray:
-        """(len(paths), *extractor.feature_shape) float32, what the networks read; `fill` is included."""
-        rows = np.empty((len(paths), *self.extractor.feature_shape), np.float32)
+        """(len(paths), *extractor.feature_shape) of `extractor.dtype`, what the networks read; `fill` is included."""
+        rows = np.empty((len(paths), *self.extractor.feature_shape), self.extractor.dtype)
 
         def put(numbers: list[int], record: Record) -> None:
             rows[numbers] = self.extractor.features(record)

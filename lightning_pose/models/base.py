@@ -38,7 +38,8 @@ class PoseModule(LightningModule):
       quaternion: with `standardize` in standard deviations around the mean training pose, otherwise in metres
       and quaternion components. The loss always compares metres and quaternion components;
     - `input_rank`: how many axes `input_shape` must have;
-    - `feature_axis`: which axis holds the columns to standardize, if not the last.
+    - `feature_axis`: which axis holds the columns to standardize, if not the last;
+    - `memory`: names of what is as long as the training split; a checkpoint's length is taken over.
 
     Then export it in `models/__init__.py` and give it a config. Constructor arguments are plain types: they are
     the checkpoint's hyperparameters, and rebuild the module anywhere.
@@ -59,6 +60,7 @@ class PoseModule(LightningModule):
 
     input_rank: ClassVar[int]
     feature_axis: ClassVar[int] = -1
+    memory: ClassVar[tuple[str, ...]] = ()
     network: nn.Module
     pose_mean: Tensor
     pose_scale: Tensor
@@ -126,6 +128,8 @@ class PoseModule(LightningModule):
         return self._decode(batch.features)
 
     def _standardized(self, features: Tensor) -> Tensor:
+        if not self.standardize_features:
+            return features
         return (features - self.feature_mean) / self.feature_scale
 
     def _unscaled(self, pose: Tensor) -> tuple[Tensor, Tensor]:
@@ -151,9 +155,11 @@ class PoseModule(LightningModule):
 
         Rows of zeros, where a frame had fewer features, do not count. A thousand frames tell enough.
         """
+        if not self.standardize_features:
+            return
         rows = features[:: -(-len(features) // 1000)].movedim(self.feature_axis, -1).flatten(0, -2)
         rows = rows[rows.any(1)]
-        if self.standardize_features and len(rows) > 1:
+        if len(rows) > 1:
             self.feature_mean.copy_(rows.mean(0).view_as(self.feature_mean))
             self.feature_scale.copy_(rows.std(0).clamp(min=1e-6).view_as(self.feature_scale))
 
@@ -227,6 +233,7 @@ class PoseModule(LightningModule):
                 f"the checkpoint holds a {saved.rpartition('.')[2]}, not a {type(self).__name__}; "
                 "give the config it was trained with"
             )
+        self._make_room(checkpoint["state_dict"])
         own = self.state_dict()
         for name, value in checkpoint["state_dict"].items():
             if name in own and own[name].shape != value.shape:
@@ -234,6 +241,17 @@ class PoseModule(LightningModule):
                     f"{name} has shape {tuple(value.shape)} in the checkpoint and {tuple(own[name].shape)} here; "
                     "give the settings it was trained with, data.extractor included"
                 )
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        self._make_room({name.removeprefix(prefix): value for name, value in state_dict.items()})
+        super()._load_from_state_dict(state_dict, prefix, *args)
+
+    def _make_room(self, state_dict: dict[str, Tensor]) -> None:
+        """Let the memory be as long as the checkpoint's; other differences in shape are left to be refused."""
+        for name in self.memory:
+            if name in state_dict:
+                tensor = self.get_parameter(name) if name in dict(self.named_parameters()) else self.get_buffer(name)
+                tensor.data = tensor.new_zeros(len(state_dict[name]), *tensor.shape[1:])
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         datamodule = getattr(self.trainer, "datamodule", None)

@@ -42,7 +42,7 @@ class LinearPoseNet(PoseModule):
     """
 
     input_rank: ClassVar[int] = 1
-    network: _FoldedLinear
+    network: Any  # _FoldedLinear; a subclass may have another with its `n_features`, `lift` and `take`
 
     def __init__(
         self,
@@ -72,7 +72,7 @@ class LinearPoseNet(PoseModule):
         return torch.optim.SGD(self.parameters())
 
     def on_train_epoch_start(self) -> None:
-        self._moments = Moments(self.input_shape[0], 7)
+        self._moments = Moments(self.network.n_features, 7)
 
     def training_step(self, batch: PoseBatch, batch_idx: int) -> None:  # type: ignore[override]
         self._add(batch, len(self.trainer.datamodule.dataset("train")))  # type: ignore[attr-defined]
@@ -129,9 +129,10 @@ class LinearPoseNet(PoseModule):
         return total
 
     def _scaled(self, batch: PoseBatch) -> tuple[Tensor, Tensor]:
-        """Features and poses as the network reads and writes them."""
+        """What the poses are regressed on, and the poses as the network writes them."""
         poses = torch.cat([batch.position_m, align_hemisphere(batch.quat_wxyz, self.quat_reference)], dim=1)
-        return self._standardized(batch.features), (poses - self.pose_mean) / self.pose_scale
+        features = self.network.lift(self._standardized(batch.features))
+        return features, (poses - self.pose_mean) / self.pose_scale
 
     def _batches(self, split: str) -> Iterator[PoseBatch]:
         """All frames of a split, in every process."""
@@ -152,9 +153,14 @@ class _FoldedLinear(nn.Module):
 
     def __init__(self, n_features: int, components: int | None) -> None:
         super().__init__()
+        self.n_features = n_features
         self.weight = nn.Parameter(torch.zeros(7, components or n_features))
         self.register_buffer("bias", torch.zeros(7))
         self.register_buffer("folded", torch.zeros(7, n_features) if components else None)
+
+    def lift(self, features: Tensor) -> Tensor:
+        """What the solution is linear in: the features."""
+        return features
 
     def take(self, solution: Ridge) -> None:
         """Become this solution."""

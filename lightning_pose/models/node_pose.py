@@ -18,7 +18,6 @@ from lightning_pose.models.graph_conv import GraphConvolution, PoseHeads
 
 __all__ = ["NodePose"]
 
-_MEMORY = ("memory_features", "memory_pose", "memory_frame", "memory_table")
 _CHUNK = 1024  # nodes whose neighbours' states are gathered at a time
 
 
@@ -59,6 +58,7 @@ class NodePose(PoseModule):
     """
 
     input_rank: ClassVar[int] = 1
+    memory: ClassVar[tuple[str, ...]] = ("memory_features", "memory_pose", "memory_frame", "memory_table")
     network: _NodeNetwork
     memory_features: Tensor
     memory_pose: Tensor
@@ -167,21 +167,9 @@ class NodePose(PoseModule):
         self._memory = None
         return super().train(mode)
 
-    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        self._make_room(checkpoint["state_dict"])
-        super().on_load_checkpoint(checkpoint)
-
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        self._make_room({name.removeprefix(prefix): value for name, value in state_dict.items()})
-        super()._load_from_state_dict(state_dict, prefix, *args)
-
     def _make_room(self, state_dict: dict[str, Tensor]) -> None:
-        """Let the memory be as long as the checkpoint's; other differences in shape are left to be refused."""
         self._memory = None
-        for name in _MEMORY:
-            if name in state_dict:
-                buffer = getattr(self, name)
-                setattr(self, name, buffer.new_zeros(len(state_dict[name]), *buffer.shape[1:]))
+        super()._make_room(state_dict)
 
 
 class _Memory(NamedTuple):

@@ -6,16 +6,16 @@ import math
 
 import torch
 from lightning import LightningDataModule
+from torch import nn
 from torch.utils.data import DataLoader
 
 from lightning_pose import models
 from lightning_pose.data.batches import PoseBatch, PoseDataset, batch_loader
 from lightning_pose.models import PoseModule
 
-__all__ = ["ARCHITECTURES", "INPUT_SHAPES", "LearnableProblem", "make_model", "random_poses"]
+__all__ = ["ARCHITECTURES", "LearnableProblem", "SmallCNN", "make_model", "random_poses"]
 
-INPUT_SHAPES = {1: [32], 2: [20, 64], 3: [16, 3, 4]}
-"""A small input for each `input_rank`."""
+_INPUT_SHAPES = {1: [32], 2: [20, 64], 3: [16, 3, 4]}
 
 _exported = [getattr(models, name) for name in models.__all__]
 ARCHITECTURES = [
@@ -26,10 +26,27 @@ ARCHITECTURES = [
 def make_model(architecture: type[PoseModule], **settings: object) -> PoseModule:
     """An architecture with its default settings, for a small input, the same weights each time."""
     torch.manual_seed(0)
-    model = architecture(input_shape=INPUT_SHAPES[architecture.input_rank], **settings)  # type: ignore[arg-type]
+    if architecture is models.PoseNet:
+        small = {"backbone": "tests.models.helpers.SmallCNN", "crop": 12, "input_shape": [3, 12, 12]}
+    else:
+        small = {"input_shape": _INPUT_SHAPES[architecture.input_rank]}
+    model = architecture(**{**small, **settings})  # type: ignore[arg-type]
     if isinstance(model, models.NodePose):
         model.remember(LearnableProblem(list(model.input_shape)).data.data)
     return model
+
+
+class SmallCNN(nn.Module):
+    """A backbone for small crops, frozen as users' modules may be."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.layers = nn.Sequential(nn.Conv2d(3, 32, 4, 4), nn.BatchNorm2d(32), nn.ReLU(), nn.Conv2d(32, 64, 3))
+        self.eval().requires_grad_(False)
+
+    def forward(self, rgb: torch.Tensor) -> torch.Tensor:
+        return self.layers(rgb * 255)
 
 
 def random_poses(count: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:

@@ -1,0 +1,127 @@
+"""KernelPoseNet: LinearPoseNet's closed form on a Gaussian kernel between images."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from lightning_pose.errors import ConfigError
+from lightning_pose.models.linear_posenet import LinearPoseNet
+from lightning_pose.ridge import Ridge
+
+__all__ = ["KernelPoseNet"]
+
+
+class KernelPoseNet(LinearPoseNet):
+    """Kernel ridge regression from (D,) features to the pose (Saunders et al., ICML 1998), without gradients.
+
+    The kernel between two images is exp(-gamma d^2 / m): d is the distance between their features, m the median of
+    d^2 between landmarks. With all training frames as landmarks, validation frames included where `refit` learns
+    from them, this is kernel ridge regression itself; with fewer its Nystroem approximation (Williams & Seeger, NIPS
+    2000), in one streaming pass like LinearPoseNet's. The checkpoint carries the landmarks' features.
+
+    Not in the thesis: its nearest relative is LinearPoseNet, which this becomes as gamma goes to 0.
+
+    Args:
+        lambdas: ridge strengths to choose from; 1 is as strong as one frame.
+        gamma: how fast the kernel falls with distance: at the median distance it is exp(-gamma).
+        landmarks: how many frames to keep at most, evenly spaced.
+        normalize: measure distances between features of unit length, as image retrieval does.
+        **kwargs: what `LinearPoseNet` takes.
+
+    Raises:
+        ConfigError: a number is not positive, or as for `LinearPoseNet`.
+    """
+
+    memory: ClassVar[tuple[str, ...]] = ("network.landmarks", "network.weight")
+    network: _KernelMachine
+
+    def __init__(
+        self,
+        lambdas: list[float] = [3e-3],  # noqa: B006  (never changed; shown as it is in --help)
+        gamma: float = 0.2,
+        landmarks: int = 2000,
+        normalize: bool = True,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(lambdas=lambdas, **kwargs)
+        if not gamma > 0 or landmarks < 1:
+            raise ConfigError(f"gamma is {gamma} and landmarks is {landmarks}; give above 0, such as 0.2 and 2000")
+        self.gamma = gamma
+        self.landmarks = landmarks
+        self.network = _KernelMachine(self.input_shape[0], normalize)
+
+    @property
+    def headline(self) -> str:
+        return f"{super().headline} gamma={self.gamma:g}"
+
+    def setup(self, stage: str) -> None:
+        super().setup(stage)
+        if stage == "fit":
+            splits = ("train", "val") if self.refit else ("train",)
+            datamodule = self.trainer.datamodule  # type: ignore[attr-defined]
+            features = torch.cat([datamodule.dataset(split).data.features for split in splits])
+            kept = torch.linspace(0, len(features) - 1, min(self.landmarks, len(features))).round().long()
+            self.network.remember(self._standardized(features[kept].to(self.device)), self.gamma)
+
+
+class _KernelMachine(nn.Module):
+    """Seven numbers, linear in an image's kernels with M landmarks.
+
+    In double precision throughout: solutions cancel large numbers.
+    """
+
+    landmarks: Tensor
+    scale: Tensor
+    bias: Tensor
+
+    def __init__(self, n_columns: int, normalize: bool) -> None:
+        super().__init__()
+        self.normalize = normalize
+        self.weight = nn.Parameter(torch.zeros(0, 7, dtype=torch.float64))
+        self.register_buffer("landmarks", torch.zeros(0, n_columns))
+        self.register_buffer("scale", torch.ones((), dtype=torch.float64))
+        self.register_buffer("bias", torch.zeros(7, dtype=torch.float64))
+        self._basis = torch.zeros(0, 0)  # (M, R), from kernels to coordinates whose products are kernels again
+
+    @property
+    def n_features(self) -> int:
+        """R: how many numbers `lift` gives."""
+        return self._basis.shape[1]
+
+    def remember(self, landmarks: Tensor, gamma: float) -> None:
+        """Take in (M, D) landmarks."""
+        self.landmarks = self._key(landmarks)
+        self.weight.data = self.weight.new_zeros(len(landmarks), 7)
+        sample = self.landmarks[:: -(-len(landmarks) // 1000)].double()
+        squared = F.pdist(sample).square()
+        spread = float(squared.median()) if len(squared) else 1.0
+        self.scale.fill_(gamma / spread if spread > 0 else gamma)
+        values, vectors = torch.linalg.eigh(self._kernel(self.landmarks))
+        kept = values > values[-1] * len(values) * torch.finfo(values.dtype).eps
+        self._basis = vectors[:, kept] / values[kept].sqrt()
+
+    def lift(self, features: Tensor) -> Tensor:
+        """(B, D) -> (B, R): images' products with each other are their kernels."""
+        return self._kernel(self._key(features)) @ self._basis
+
+    def take(self, solution: Ridge) -> None:
+        """Become this solution, which is linear in `lift`."""
+        self.weight.copy_(self._basis @ solution.weight.T)
+        self.bias.copy_(solution.bias)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(B, D) -> (B, 7)."""
+        return (self._kernel(self._key(features)) @ self.weight + self.bias).to(features.dtype)
+
+    def _key(self, features: Tensor) -> Tensor:
+        return F.normalize(features, dim=-1) if self.normalize else features
+
+    def _kernel(self, keys: Tensor) -> Tensor:
+        """(B, D) -> (B, M)."""
+        ours, theirs = keys.double(), self.landmarks.double()
+        squared = ours.square().sum(1, keepdim=True) + theirs.square().sum(1) - 2 * ours @ theirs.T
+        return torch.exp(-self.scale * squared.clamp(min=0))

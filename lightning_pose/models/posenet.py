@@ -1,0 +1,132 @@
+"""PoseNet: a pretrained CNN fine-tuned from end to end, the peer that cheaper systems are measured against."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from lightning_pose.data.batches import PoseBatch
+from lightning_pose.errors import ConfigError
+from lightning_pose.features.backbones import BACKBONES, build_backbone
+from lightning_pose.models.base import PoseModule
+
+__all__ = ["PoseNet"]
+
+
+class PoseNet(PoseModule):
+    """A CNN, a fully connected layer and the pose, all trained (Kendall et al., ICCV 2015), from (3, H, W) images.
+
+    In training each image is cut at random, otherwise in the middle. The learned balance of position and
+    orientation of Kendall & Cipolla (CVPR 2017) is `loss: {form: split, learned_weights: true}`, the fixed one
+    `orientation_weight`. `trainer.precision: 16-mixed` halves time and memory on a GPU, and `bf16-mixed` on CPUs
+    that have bfloat16; poses and loss stay in single precision.
+
+    The pretrained weights are read when training starts: a checkpoint needs them no more.
+
+    Args:
+        backbone: a CNN, as for `lightning_pose.features.backbones.build_backbone`.
+        weights: `imagenet`, `places365`, `none` or the path of a checkpoint, likewise.
+        crop: side of the square that is cut out of each image, in pixels.
+        units: width of the fully connected layer.
+        dropout: after it.
+        **kwargs: what `PoseModule` takes.
+
+    Raises:
+        ConfigError: a number is out of its range, the images are no RGB or smaller than the crop, or the crop is too
+            small for the backbone.
+        CheckpointError: when training starts, the weights cannot be downloaded or read.
+    """
+
+    input_rank: ClassVar[int] = 3
+    network: _FineTuned
+
+    def __init__(
+        self,
+        backbone: str = "efficientnet_lite0",
+        weights: str = "imagenet",
+        crop: int = 224,
+        units: int = 2048,
+        dropout: float = 0.5,
+        standardize_features: bool = False,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(standardize_features=standardize_features, **kwargs)
+        channels, height, width = self.input_shape
+        if channels != 3:
+            raise ConfigError(
+                f"PoseNet reads RGB images, not {channels} channels; "
+                "give lightning_pose.features.Pixels as data.extractor"
+            )
+        if not 1 <= crop <= min(height, width):
+            raise ConfigError(f"crop is {crop} and images are {height} x {width}; give 1 to {min(height, width)}")
+        if units < 1 or not 0 <= dropout < 1:
+            raise ConfigError(f"units is {units} and dropout {dropout}; give 1 or more, and 0 to below 1")
+        self.backbone = backbone
+        self.weights = weights
+        self.crop = crop
+        cnn = build_backbone(backbone, "none" if backbone in BACKBONES else "imagenet")
+        self.network = _FineTuned(cnn.train().requires_grad_(True), _width(cnn, backbone, crop), units, dropout)
+
+    @property
+    def headline(self) -> str:
+        return f"{self.backbone.rpartition('.')[2]} {self.crop}"
+
+    def setup(self, stage: str) -> None:
+        super().setup(stage)
+        if stage == "fit":
+            self.network.cnn.load_state_dict(build_backbone(self.backbone, self.weights).state_dict())
+
+    def _decode(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        top, left = ((size - self.crop) // 2 for size in features.shape[-2:])
+        return super()._decode(features[..., top : top + self.crop, left : left + self.crop])
+
+    def _decode_batch(self, batch: PoseBatch) -> tuple[Tensor, Tensor]:
+        if not self.training:
+            return self._decode(batch.features)
+        return super()._decode(_random_crops(batch.features, self.crop))
+
+
+class _FineTuned(nn.Module):
+    def __init__(self, cnn: nn.Module, width: int, units: int, dropout: float) -> None:
+        super().__init__()
+        self.cnn = cnn
+        self.head = nn.Sequential(nn.Linear(width, units), nn.ReLU(), nn.Dropout(dropout), nn.Linear(units, 7))
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        """(B, 3, h, w) RGB in 0..255 -> (B, 7)."""
+        vector = _pooled(self.cnn(pixels.float() / 255))
+        with torch.autocast(pixels.device.type, enabled=False):  # half precision would round poses to centimetres
+            return self.head(vector.float())
+
+
+def _pooled(out: Tensor) -> Tensor:
+    return out.mean((2, 3)) if out.ndim == 4 else out
+
+
+def _random_crops(images: Tensor, side: int) -> Tensor:
+    """(B, 3, side, side), each cut out of its (3, H, W) at a place of its own."""
+    rows, columns = (torch.randint(size - side + 1, (len(images),)).tolist() for size in images.shape[-2:])
+    cut = zip(images, rows, columns, strict=True)
+    return torch.stack([image[:, top : top + side, left : left + side] for image, top, left in cut])
+
+
+@torch.no_grad()
+def _width(cnn: nn.Module, backbone: str, crop: int) -> int:
+    """How many columns the CNN's pooled answer has."""
+    training = cnn.training
+    try:
+        out = _pooled(cnn.eval()(torch.zeros(1, 3, crop, crop)))
+    except RuntimeError as error:
+        raise ConfigError(
+            f"{backbone} cannot take a crop of {crop} ({error}); give a larger one, such as 224"
+        ) from error
+    finally:
+        cnn.train(training)
+    if out.ndim != 2 or out.isnan().any():
+        raise ConfigError(
+            f"{backbone} returned {tuple(out.shape)} for one crop of {crop}; its forward must return (B, C) or "
+            "(B, C, h, w), with a larger crop if there are no cells"
+        )
+    return out.shape[1]
