@@ -22,8 +22,9 @@ from lightning_pose.callbacks import BestCheckpoint, LastCheckpoint, RunRecorder
 from lightning_pose.errors import CheckpointError, ConfigError
 from lightning_pose.evaluation import TestReport
 from lightning_pose.localize import read_checkpoint
-from lightning_pose.models import PoseModule
+from lightning_pose.models import ClipModule, PoseModule
 from lightning_pose.progress import EpochBar
+from lightning_pose.sequences import chain_test
 from lightning_pose.tracking import default_tracking_uri, last_run
 from lightning_pose.tum import write_sequences
 
@@ -203,10 +204,13 @@ class PoseCLI(LightningCLI):
 
     def predict(self, model: PoseModule, datamodule: Any, **kwargs: Any) -> None:
         """Write one TUM file a sequence of the test split."""
-        batches = self.trainer.predict(model, datamodule=datamodule, **kwargs) or []
-        position_m, quat_wxyz = (torch.cat(parts).numpy() for parts in zip(*batches, strict=True))
+        batches: list[Any] = self.trainer.predict(model, datamodule=datamodule, **kwargs) or []
         scene = datamodule.scene
-        frames = [scene.frames[i] for i in scene.splits["test"]]
+        if isinstance(model, ClipModule):
+            frames, position_m, quat_wxyz = chain_test(model, datamodule)
+        else:
+            frames = [scene.frames[i] for i in scene.splits["test"]]
+            position_m, quat_wxyz = (torch.cat(parts).numpy() for parts in zip(*batches, strict=True))
         folder = Path(self.trainer.default_root_dir) / "predictions" / f"{type(model).__name__}-{scene.name}"
         for file in write_sequences(folder, frames, position_m, quat_wxyz):
             print(file)

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import torch
 
 from lightning_pose.errors import CheckpointError
 from lightning_pose.features.base import FeatureExtractor
+from lightning_pose.relative import RelativeFrame
+from lightning_pose.sequences import locate_sequence
 from lightning_pose.spec import build
 
 if TYPE_CHECKING:
-    from lightning_pose.models import PoseModule
+    from lightning_pose.models import ClipModule, PoseModule
 
 __all__ = ["Localizer", "read_checkpoint"]
 
@@ -45,11 +47,15 @@ class Localizer:
     Args:
         extractor: makes the features.
         model: makes the poses.
+        clips: for a model of clips, how many frames one has and in which axes it answers.
     """
 
-    def __init__(self, extractor: FeatureExtractor, model: PoseModule) -> None:
+    def __init__(
+        self, extractor: FeatureExtractor, model: PoseModule, clips: tuple[int, RelativeFrame] | None = None
+    ) -> None:
         self.extractor = extractor
         self.model = model.eval()
+        self.clips = clips
 
     @classmethod
     def from_checkpoint(cls, path: str | Path) -> Localizer:
@@ -64,7 +70,9 @@ class Localizer:
             raise CheckpointError(f"{path} does not say which features it reads; train with a data module")
         model: PoseModule = build(specs["model"])
         model.load_state_dict(checkpoint["state_dict"])
-        return cls(build(specs["data"]["init_args"]["extractor"]), model)
+        data = specs["data"]["init_args"]
+        clips = (data["clip_length"], data["relative_frame"]) if "clip_length" in data else None
+        return cls(build(data["extractor"]), model, clips)
 
     def __call__(self, images: Sequence[str | Path | np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Locate images.
@@ -73,7 +81,8 @@ class Localizer:
             images: M files, or uint8 arrays as `extractor.color` asks for: (H, W) gray or (H, W, 3) RGB.
 
         Returns:
-            position_m (M, 3) and quat_wxyz (M, 4), camera-to-world.
+            position_m (M, 3) and quat_wxyz (M, 4), camera-to-world. A model of clips takes the images for a video, in
+            order, and the first camera for the world.
 
         Raises:
             ImageError: an image cannot be read.
@@ -82,6 +91,9 @@ class Localizer:
         arrays = [image if isinstance(image, np.ndarray) else read(image) for image in images]
         records = self.extractor.extract(arrays)
         features = torch.from_numpy(np.stack([self.extractor.features(record) for record in records]))
+        if self.clips is not None:
+            chained = locate_sequence(cast("ClipModule", self.model), features, *self.clips)
+            return chained[0].numpy(), chained[1].numpy()
         with torch.inference_mode():
             pose = self.model(features)
         return pose.position_m.numpy(), pose.quat_wxyz.numpy()

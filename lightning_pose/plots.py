@@ -82,8 +82,7 @@ def trajectory(
     """
     truth, prediction = np.asarray(truth_m, float), np.asarray(prediction_m, float)
     names = np.asarray(["" for _ in truth] if sequences is None else sequences)
-    across, up = sorted(np.argsort(-np.ptp(truth, axis=0), kind="stable")[:2])
-    plane = [across, up]
+    plane = across, up = longest_axes(truth)
     training = np.asarray(np.empty((0, 3)) if training_m is None else training_m, float)[:, plane]
     truth, prediction = truth[:, plane], prediction[:, plane]
     low, high = _view(truth, prediction)
@@ -157,7 +156,7 @@ def cumulative_errors(
             style = {"color": color, "linestyle": dash, "linewidth": 2.6 if curve == name else 1.6}
             median = f"{curve}  {np.median(errors):.3g}{symbol}"
             axes.plot(x, y, drawstyle="steps-post", label=median, zorder=zorder, **style)
-        _log_axis(axes, "x", limits)
+        log_axis(axes, "x", limits)
         axes.set(ylim=(0, 1.02), xlabel=label)
         axes.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
         best_first = np.argsort([np.median(errors) for errors in curves.values()], kind="stable")
@@ -197,12 +196,17 @@ def error_vs_distance(
     centres, medians = _binned_median(distance, error)
     axes.plot(centres, medians, "o-", color=TRUTH, linewidth=1.8, markersize=5, label="median of a tenth")
     for axis in ("x", "y"):
-        _log_axis(axes, axis, limits)
+        log_axis(axes, axis, limits)
     axes.set(
         aspect="equal", xlabel=f"distance to the nearest training pose ({unit})", ylabel=f"position error ({unit})"
     )
     figure.legend(loc="outside lower center", ncols=3)
     return figure
+
+
+def longest_axes(truth_m: np.ndarray) -> list[int]:
+    """The two axes, in order, along which positions (N, 3) extend furthest."""
+    return sorted(int(axis) for axis in np.argsort(-np.ptp(truth_m, axis=0), kind="stable")[:2])
 
 
 def _view(truth: np.ndarray, prediction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -228,7 +232,8 @@ def _log_limits(errors: np.ndarray) -> tuple[float, float]:
     return float(np.quantile(finite, 0.01)) * 0.9, float(finite.max()) * 1.1
 
 
-def _log_axis(axes: Axes, which: str, limits: tuple[float, float]) -> None:
+def log_axis(axes: Axes, which: str, limits: tuple[float, float]) -> None:
+    """Make the axis `x` or `y` logarithmic between limits, with plain numbers at 1, 2, 5 or at powers of ten."""
     axes.set(**{f"{which}scale": "log", f"{which}lim": limits})
     axis = axes.xaxis if which == "x" else axes.yaxis
     axis.set_major_locator(LogLocator(subs=(1, 2, 5) if limits[1] < 1000 * limits[0] else (1,)))

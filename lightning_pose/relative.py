@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from lightning_pose.errors import ConfigError
-from lightning_pose.geometry import quat_conjugate, quat_multiply, quat_normalize, quat_rotate
+from lightning_pose.geometry import compose_pose, quat_conjugate, quat_multiply, quat_normalize, quat_rotate
 
-__all__ = ["Chain", "RelativeFrame", "absolute_poses", "check_relative_frame", "relative_poses"]
+__all__ = ["Chain", "RelativeFrame", "absolute_poses", "chain_steps", "check_relative_frame", "relative_poses"]
 
 RelativeFrame = Literal["camera", "world"]
 """The axes of a relative position: those of the clip's first camera, or the world's as eq. 6.1 has it."""
@@ -68,6 +68,28 @@ def absolute_poses(
     first_position, first_quat = first_position_m.unsqueeze(-2), first_quat_wxyz.unsqueeze(-2)
     moved = quat_rotate(first_quat, position_m) if frame == "camera" else position_m
     return first_position + moved, quat_multiply(first_quat, quat_wxyz)
+
+
+def chain_steps(position_m: Tensor, quat_wxyz: Tensor) -> tuple[Tensor, Tensor]:
+    """Compose steps, each the pose of a camera seen from the one before it.
+
+    Args:
+        position_m: (B, T - 1, 3), each in the axes of the camera before.
+        quat_wxyz: (B, T - 1, 4), unit.
+
+    Returns:
+        position_m (B, T, 3) in the axes of the first camera and quat_wxyz (B, T, 4) with w >= 0, both relative to
+        the first camera, which comes first.
+    """
+    position = position_m.new_zeros(len(position_m), 3)
+    quat = quat_wxyz.new_tensor([1.0, 0.0, 0.0, 0.0]).expand(len(quat_wxyz), 4)
+    positions, quats = [position], [quat]
+    for step in range(position_m.shape[1]):
+        position, quat = compose_pose(position, quat, position_m[:, step], quat_wxyz[:, step])
+        quat = quat_normalize(torch.where(quat[:, :1] < 0, -quat, quat))
+        positions.append(position)
+        quats.append(quat)
+    return torch.stack(positions, dim=1), torch.stack(quats, dim=1)
 
 
 class Chain:

@@ -17,7 +17,14 @@ from lightning_pose.summary import RECALL_THRESHOLDS
 from tests.helpers import REPOSITORY, Workplace
 
 CONFIGS = sorted((REPOSITORY / "configs").glob("*.yaml"))
-BASELINES = ["train_mean", "retrieval_top1", "retrieval_top5", "oracle"]
+BASELINES = {
+    "ImageDataModule": ["train_mean", "retrieval_top1", "retrieval_top5", "oracle"],
+    "ClipDataModule": ["no_motion", "constant_velocity", "visual_odometry"],
+}
+FIGURES = {
+    "ImageDataModule": {"trajectory.png", "cumulative_errors.png", "error_vs_distance.png"},
+    "ClipDataModule": {"trajectory.png", "error_by_length.png"},
+}
 ERRORS = [f"{name}_{statistic}_{unit}" for name, unit in (("position", "m"), ("orientation", "deg"))
           for statistic in ("median", "mean", "p95")]  # fmt: skip
 COSTS = ["train_seconds", "parameters", "checkpoint_bytes", "ms_per_frame", "features_ms_per_frame", "frame_bytes"]
@@ -48,22 +55,25 @@ def test_it_trains_tests_and_keeps_its_results(
 ) -> None:
     monkeypatch.setenv("LIGHTNING_POSE_CACHE", str(workplace.folder / "cache"))
     small = ["--trainer.max_epochs", "1", "--trainer.accelerator", "cpu"]
-    extractor = yaml.safe_load(config.read_text())["data"]["init_args"]["extractor"]
+    data = yaml.safe_load(config.read_text())["data"]
+    kind, extractor = data["class_path"].rpartition(".")[2], data["init_args"]["extractor"]
+    if kind == "ClipDataModule":
+        small += ["--data.clip_length", "4"]
     if issubclass(_class_of(extractor["class_path"]), LocalExtractor):
         small += ["--data.extractor.n_features", "20"]
     assert workplace.command("fit", "--config", config, "--data.root", room, *small) == 0
     (run,) = workplace.runs()
-    _check_record(run.info.status, run.data.metrics, run.data.tags)
+    _check_record(run.info.status, run.data.metrics, run.data.tags, BASELINES[kind])
     table = capsys.readouterr().out
-    for system in [run.data.tags["architecture"], *BASELINES]:
+    for system in [run.data.tags["architecture"], *BASELINES[kind]]:
         assert f" {system} " in table
-    _check_artifacts(workplace, run.info.run_id, room)
+    _check_artifacts(workplace, run.info.run_id, room, FIGURES[kind])
 
 
-def _check_record(status: str, metrics: dict[str, float], tags: dict[str, str]) -> None:
+def _check_record(status: str, metrics: dict[str, float], tags: dict[str, str], baselines: list[str]) -> None:
     assert status == "FINISHED"
     assert (tags["scene"], tags["dataset"], tags["ground_truth"]) == ("small", "7scenes", "synthetic")
-    groups = ["test", *(f"baseline/{name}" for name in BASELINES)]
+    groups = ["test", *(f"baseline/{name}" for name in baselines)]
     expected = {f"{group}/{name}" for group in groups for name in (*ERRORS, *RECALL_THRESHOLDS)}
     expected |= {f"cost/{name}" for name in COSTS} | {"test/skill_position", "test/skill_orientation"}
     expected |= {"train/loss", "val/loss", "val/position_median_m", "val/orientation_median_deg"}
@@ -71,13 +81,13 @@ def _check_record(status: str, metrics: dict[str, float], tags: dict[str, str]) 
     assert all(np.isfinite(metrics[name]) for name in expected)
 
 
-def _check_artifacts(workplace: Workplace, run_id: str, room: Path) -> None:
+def _check_artifacts(workplace: Workplace, run_id: str, room: Path, figures: set[str]) -> None:
     def kept(folder: str) -> set[str]:
         return {Path(file.path).name for file in workplace.client.list_artifacts(run_id, folder)}
 
     assert "config.yaml" in kept("")
     assert kept("checkpoints") == {"best.ckpt", "last.ckpt"}
-    assert kept("figures") == {"trajectory.png", "cumulative_errors.png", "error_vs_distance.png"}
+    assert kept("figures") == figures
     assert kept("trajectories") == {"truth", "predictions"}
     assert kept("trajectories/truth") == kept("trajectories/predictions") != set()
     images = sorted(room.glob("seq-*/*.png"))[:2]

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 
 from lightning_pose.errors import ConfigError
 from lightning_pose.geometry import orientation_error_deg, quat_normalize, relative_pose
-from lightning_pose.relative import Chain, RelativeFrame, absolute_poses, check_relative_frame, relative_poses
+from lightning_pose.relative import (
+    Chain,
+    RelativeFrame,
+    absolute_poses,
+    chain_steps,
+    check_relative_frame,
+    relative_poses,
+)
 
 FRAMES: list[RelativeFrame] = ["camera", "world"]
 
@@ -93,3 +102,15 @@ def test_clips_that_do_not_overlap_are_refused() -> None:
         chain.add([2, 3], *relative_poses(*walk(2)))
     with pytest.raises(ConfigError, match="relative_frame is 'body'; give one of camera, world"):
         check_relative_frame("body")
+
+
+def test_chained_steps_turn_with_the_camera() -> None:
+    """Four quarter turns to the right, one metre ahead before each: a square."""
+    half = math.sqrt(0.5)
+    position_m, quat_wxyz = chain_steps(
+        torch.tensor([0.0, 0, 1]).expand(1, 4, 3).double(), torch.tensor([half, 0, half, 0]).expand(1, 4, 4).double()
+    )
+    expected = torch.tensor([[0.0, 0, 0], [0, 0, 1], [1, 0, 1], [1, 0, 0], [0, 0, 0]]).double()
+    torch.testing.assert_close(position_m[0], expected)
+    torch.testing.assert_close(quat_wxyz[0, 4], torch.eye(4)[0].double())
+    assert (quat_wxyz[..., 0] >= 0).all()

@@ -13,7 +13,7 @@ __all__ = ["DrawnDataset", "PoseBatch", "PoseDataset", "batch_loader"]
 
 
 class PoseBatch(NamedTuple):
-    """Features and poses of B frames.
+    """Features and poses of B frames, or of B clips of T frames, with one axis more.
 
     Attributes:
         features: (B, ...) as the extractor shapes them; float32, or uint8 for images.
@@ -70,6 +70,6 @@ def _as_is(batch: Any) -> PoseBatch:
     return batch
 
 
-def batch_loader(dataset: PoseDataset, batch_size: int, shuffle: bool) -> DataLoader[PoseBatch]:
+def batch_loader(dataset: Dataset[PoseBatch], batch_size: int, shuffle: bool) -> DataLoader[PoseBatch]:
     """A DataLoader whose batches come from `__getitems__`; Lightning can still shard it over processes."""
     return DataLoader(dataset, batch_size=batch_size, shuffle=shuffle, collate_fn=_as_is)

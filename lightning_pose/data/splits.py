@@ -36,13 +36,16 @@ MAX_BLOCKS = 4
 MIN_BLOCK = 10
 
 
-def make_splits(scene: Scene, val_fraction: float, test_fraction: float) -> Mapping[str, np.ndarray]:
+def make_splits(
+    scene: Scene, val_fraction: float, test_fraction: float, val_block: int = 1
+) -> Mapping[str, np.ndarray]:
     """Ascending frame indices of `train`, `val` and `test`, disjoint.
 
     Args:
         scene: with the official `train` and `test` in its `splits`, or with none.
         val_fraction: part of the training frames to validate on; 0 leaves `val` empty.
         test_fraction: part of all frames to test on, where the scene has no official split.
+        val_block: see `hold_out`.
 
     Raises:
         ConfigError: a fraction is outside 0..1, or leaves no frame to train on.
@@ -55,12 +58,12 @@ def make_splits(scene: Scene, val_fraction: float, test_fraction: float) -> Mapp
         train, test = scene.splits["train"], scene.splits["test"]
     else:
         train, test = hold_out(np.arange(len(sequences)), sequences, test_fraction, "test_fraction")
-    train, val = hold_out(train, sequences, val_fraction, "val_fraction")
+    train, val = hold_out(train, sequences, val_fraction, "val_fraction", val_block)
     return {"train": train, "val": val, "test": test}
 
 
 def hold_out(
-    indices: np.ndarray, sequences: np.ndarray, fraction: float, setting: str
+    indices: np.ndarray, sequences: np.ndarray, fraction: float, setting: str, block: int = 1
 ) -> tuple[np.ndarray, np.ndarray]:
     """Divide frames into kept and held out.
 
@@ -69,6 +72,8 @@ def hold_out(
         sequences: the sequence of every frame of the scene.
         fraction: about which part of them to hold out; at least one frame unless it is 0.
         setting: what the user calls the fraction, for the message.
+        block: hold out runs of this many frames at least (clips need them), where sequences are that long: rather
+            than halves, whole sequences, and longer blocks.
 
     Returns:
         the kept and the held-out indices, ascending.
@@ -83,18 +88,20 @@ def hold_out(
     wanted = max(1, round(fraction * len(indices)))
     if wanted >= len(indices):
         raise ConfigError(f"{setting} {fraction} leaves none of {len(indices)} frames to train on; lower it")
-    held = _halves(indices, sequences[indices], wanted)
+    held = _halves(indices, sequences[indices], wanted, block)
     if held is None:
-        held = _blocks(indices, sequences, wanted)
+        held = _whole(indices, sequences[indices], wanted, block)
+    if held is None:
+        held = _blocks(indices, sequences, wanted, block)
     return np.setdiff1d(indices, held), held
 
 
-def _halves(indices: np.ndarray, sequence_of: np.ndarray, wanted: int) -> np.ndarray | None:
-    """Halves of evenly spaced sequences, `wanted` frames or more; None where that takes far too many frames."""
-    names, lengths = np.unique(sequence_of, return_counts=True)
-    names = names[np.argsort([np.argmax(sequence_of == name) for name in names])]  # as they come in the scene
+def _halves(indices: np.ndarray, sequence_of: np.ndarray, wanted: int, block: int) -> np.ndarray | None:
+    """Halves of evenly spaced sequences, `wanted` frames or more; None where that takes far too many frames, or a half
+    is shorter than a block."""
+    names, lengths = _sequences(sequence_of)
     half = int(np.median(lengths)) // 2
-    if half == 0 or MAX_BLOCKS * half > 2 * wanted:
+    if half < block or MAX_BLOCKS * half > 2 * wanted:
         return None
     count = max(MAX_BLOCKS, -(-wanted // half))
     if count > len(names):
@@ -107,12 +114,29 @@ def _halves(indices: np.ndarray, sequence_of: np.ndarray, wanted: int) -> np.nda
     return np.sort(np.concatenate(held))
 
 
-def _blocks(indices: np.ndarray, sequences: np.ndarray, wanted: int) -> np.ndarray:
+def _whole(indices: np.ndarray, sequence_of: np.ndarray, wanted: int, block: int) -> np.ndarray | None:
+    """Evenly spaced whole sequences, `wanted` frames or more; None where halves or parts of one are a block as well."""
+    names, lengths = _sequences(sequence_of)
+    length = int(np.median(lengths))
+    count = -(-wanted // length)
+    if not length // 2 < block <= length or length > 2 * wanted or count >= len(names):
+        return None
+    return indices[np.isin(sequence_of, [names[place] for place in _evenly(count, len(names))])]
+
+
+def _sequences(sequence_of: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Names of sequences as they come in the scene, and how many frames each has."""
+    names, first, lengths = np.unique(sequence_of, return_index=True, return_counts=True)
+    order = np.argsort(first)
+    return names[order], lengths[order]
+
+
+def _blocks(indices: np.ndarray, sequences: np.ndarray, wanted: int, block: int) -> np.ndarray:
     """Evenly spaced blocks, `wanted` frames together, none across a gap or the border of two sequences."""
     breaks = np.flatnonzero((np.diff(indices) > 1) | (sequences[indices[1:]] != sequences[indices[:-1]])) + 1
     runs = np.array([0, *breaks, len(indices)])
-    count = min(max(wanted // MIN_BLOCK, 1), MAX_BLOCKS)
-    lengths = [len(part) for part in np.array_split(np.arange(wanted), count)]
+    count = min(max(wanted // max(MIN_BLOCK, block), 1), MAX_BLOCKS)
+    lengths = [max(block, len(part)) for part in np.array_split(np.arange(wanted), count)]
     held = []
     for centre, length in zip(_evenly(count, len(indices)), lengths, strict=True):
         run = np.searchsorted(runs, centre, side="right") - 1

@@ -76,6 +76,19 @@ class FeatureExtractor(ABC):
         """What image retrieval compares, out of (B, *feature_shape): all of it, unless more was appended."""
         return features
 
+    def check_mirror(self) -> None:
+        """Refuse an extractor that has no `mirror`.
+
+        Raises:
+            ConfigError: the features of a mirrored image do not follow from those of the image.
+        """
+        if type(self).mirror is FeatureExtractor.mirror:
+            raise ConfigError(f"data.mirror is on, but {self.name} features cannot be mirrored; turn it off")
+
+    def mirror(self, features: Tensor) -> Tensor:
+        """Features (..., *feature_shape) of the images mirrored left to right, from those of the images."""
+        raise NotImplementedError
+
 
 class LocalExtractor(FeatureExtractor):
     """Keypoints with descriptors, strongest first; each record holds

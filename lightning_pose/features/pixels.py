@@ -67,6 +67,9 @@ class Pixels(FeatureExtractor):
         tiny = F.adaptive_avg_pool2d(gray, _TINY).flatten(1)
         return tiny - tiny.mean(1, keepdim=True)
 
+    def mirror(self, features: Tensor) -> Tensor:
+        return features.flip(-1)
+
     def _fit(self, image: np.ndarray) -> np.ndarray:
         """(H, W, 3) -> (height, width, 3)."""
         rows, columns = image.shape[:2]

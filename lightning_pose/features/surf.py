@@ -108,6 +108,21 @@ class SURF(LocalExtractor):
                 }
         return records
 
+    def check_mirror(self) -> None:
+        """Refuse oriented descriptors: they are mirrored around an axis that only the image knows."""
+        if not self.upright:
+            raise ConfigError("data.mirror is on, but SURF descriptors are oriented; set upright: true, or turn it off")
+
+    def mirror(self, features: Tensor) -> Tensor:
+        """(..., N, D): a descriptor's 4 x 4 cells change sides, its sums across the image their sign, and so does x.
+
+        In OpenCV's order cells go to the right first, and a cell's sums are upwards, across, and of both sizes.
+        """
+        cells = features[..., :64].unflatten(-1, (4, 4, 4)).flip(-3) * features.new_tensor([1.0, -1, 1, 1])
+        rest = features[..., 64:].clone()
+        rest[..., :1] = -rest[..., :1]
+        return torch.cat([cells.flatten(-3), rest], dim=-1)
+
     def _run(self, gray: Tensor, n: int) -> SurfFeatures:
         chunks = [self._chunk(chunk, n) for chunk in gray.split(1 if gray.device.type == "cpu" else BATCH)]
         return SurfFeatures(*(torch.cat(column) for column in zip(*chunks, strict=True)))

@@ -1,6 +1,9 @@
 """The architectures, one file each; `base` says how to add another."""
 
 from lightning_pose.models.base import Pose, PoseModule
+from lightning_pose.models.clip import ClipModule
+from lightning_pose.models.cnn_3d import CNN3D
+from lightning_pose.models.cnn_rnn import CNNRNN
 from lightning_pose.models.dense_posenet import DensePoseNet
 from lightning_pose.models.graph_pose import GraphPose
 from lightning_pose.models.kernel_posenet import KernelPoseNet
@@ -11,6 +14,9 @@ from lightning_pose.models.surf_cnn import SurfCNN
 from lightning_pose.models.surf_lstm import SurfLSTM
 
 __all__ = [
+    "CNN3D",
+    "CNNRNN",
+    "ClipModule",
     "DensePoseNet",
     "GraphPose",
     "KernelPoseNet",

@@ -21,6 +21,8 @@ __all__ = ["Pose", "PoseModule"]
 
 Stage = Literal["train", "val", "test"]
 
+_MOST_ELEMENTS = 2**25  # of the features that the scale is learnt from, where frames are large
+
 
 class Pose(NamedTuple):
     """Camera-to-world poses: `position_m` (..., 3) in metres, `quat_wxyz` (..., 4) unit."""
@@ -37,7 +39,7 @@ class PoseModule(LightningModule):
     - `self.network`: features (B, *input_shape) -> (B, 7), three numbers for the position and four for the
       quaternion: with `standardize` in standard deviations around the mean training pose, otherwise in metres
       and quaternion components. The loss always compares metres and quaternion components;
-    - `input_rank`: how many axes `input_shape` must have;
+    - `input_ranks`: how many axes `input_shape` may have;
     - `feature_axis`: which axis holds the columns to standardize, if not the last;
     - `memory`: names of what is as long as the training split; a checkpoint's length is taken over.
 
@@ -58,7 +60,7 @@ class PoseModule(LightningModule):
         ConfigError: `input_shape` does not suit the architecture, or a rate is out of its range.
     """
 
-    input_rank: ClassVar[int]
+    input_ranks: ClassVar[tuple[int, ...]]
     feature_axis: ClassVar[int] = -1
     memory: ClassVar[tuple[str, ...]] = ()
     network: nn.Module
@@ -83,9 +85,9 @@ class PoseModule(LightningModule):
         self.save_hyperparameters(logger=False)  # the run's recorder logs them, with the data's
         self.hparams["loss"] = asdict(loss)  # plain types: checkpoints are read with weights_only
         self.hparams["input_shape"] = list(input_shape)
-        if len(input_shape) != self.input_rank:
+        if len(input_shape) not in self.input_ranks:
             raise ConfigError(
-                f"{type(self).__name__} reads features with {self.input_rank} axes, "
+                f"{type(self).__name__} reads features with {' or '.join(map(str, self.input_ranks))} axes, "
                 f"not of shape {tuple(input_shape)}; choose another data.extractor"
             )
         if not learning_rate > 0:
@@ -157,17 +159,22 @@ class PoseModule(LightningModule):
         """
         if not self.standardize_features:
             return
-        rows = features[:: -(-len(features) // 1000)].movedim(self.feature_axis, -1).flatten(0, -2)
-        rows = rows[rows.any(1)]
+        frames = min(1000, max(1, _MOST_ELEMENTS // max(1, features[0].numel())))
+        rows = features[:: -(-len(features) // frames)].movedim(self.feature_axis, -1).flatten(0, -2)
+        rows = rows[rows.any(1)].float()
         if len(rows) > 1:
             self.feature_mean.copy_(rows.mean(0).view_as(self.feature_mean))
             self.feature_scale.copy_(rows.std(0).clamp(min=1e-6).view_as(self.feature_scale))
 
     def setup(self, stage: str) -> None:
         if stage == "fit":
-            train = self.trainer.datamodule.dataset("train").data  # type: ignore[attr-defined]
-            self.fit_scale(train.position_m.to(self.device), train.quat_wxyz.to(self.device))
-            self.fit_feature_scale(train.features)
+            train = self.trainer.datamodule.dataset("train")  # type: ignore[attr-defined]
+            self.fit_scale(*(part.to(self.device) for part in self._training_poses(train)))
+            self.fit_feature_scale(train.data.features)
+
+    def _training_poses(self, train: Any) -> tuple[Tensor, Tensor]:
+        """Positions (M, 3) and quaternions (M, 4) that the network is to answer with in training."""
+        return train.data.position_m, train.data.quat_wxyz
 
     def _step(self, batch: PoseBatch, stage: Stage) -> tuple[Tensor, Pose]:
         """The one step behind training, validation and test: decode, compare, log."""
@@ -179,8 +186,12 @@ class PoseModule(LightningModule):
         pose = Pose(position_m, quat_normalize(quat_raw))
         if stage != "train":
             metrics = self.val_metrics if stage == "val" else self.test_metrics
-            metrics.update(*pose, batch.position_m, batch.quat_wxyz)
+            metrics.update(*self._judged(pose), *self._judged(Pose(batch.position_m, batch.quat_wxyz)))
         return terms["total"], pose
+
+    def _judged(self, pose: Pose) -> Pose:
+        """The part of a batch's poses that metrics count."""
+        return pose
 
     def training_step(self, batch: PoseBatch, batch_idx: int) -> Tensor:
         return self._step(batch, "train")[0]

@@ -33,7 +33,7 @@ class DensePoseNet(PoseModule):
         ConfigError: `units` or `components` is not positive; in `fit`, more components than the training features have.
     """
 
-    input_rank: ClassVar[int] = 1
+    input_ranks: ClassVar[tuple[int, ...]] = (1,)
 
     def __init__(
         self,

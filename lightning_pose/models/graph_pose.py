@@ -37,7 +37,7 @@ class GraphPose(PoseModule):
         ConfigError: a number is out of its range, or a convolution cannot be built.
     """
 
-    input_rank: ClassVar[int] = 3
+    input_ranks: ClassVar[tuple[int, ...]] = (3,)
     feature_axis: ClassVar[int] = -3
 
     def __init__(

@@ -41,7 +41,7 @@ class LinearPoseNet(PoseModule):
             validation frames, or more components than the training features have.
     """
 
-    input_rank: ClassVar[int] = 1
+    input_ranks: ClassVar[tuple[int, ...]] = (1,)
     network: Any  # _FoldedLinear; a subclass may have another with its `n_features`, `lift` and `take`
 
     def __init__(

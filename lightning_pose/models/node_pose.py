@@ -57,7 +57,7 @@ class NodePose(PoseModule):
         ConfigError: a number is out of its range, or a convolution cannot be built.
     """
 
-    input_rank: ClassVar[int] = 1
+    input_ranks: ClassVar[tuple[int, ...]] = (1,)
     memory: ClassVar[tuple[str, ...]] = ("memory_features", "memory_pose", "memory_frame", "memory_table")
     network: _NodeNetwork
     memory_features: Tensor

@@ -39,7 +39,7 @@ class PoseNet(PoseModule):
         CheckpointError: when training starts, the weights cannot be downloaded or read.
     """
 
-    input_rank: ClassVar[int] = 3
+    input_ranks: ClassVar[tuple[int, ...]] = (3,)
     network: _FineTuned
 
     def __init__(

@@ -31,7 +31,7 @@ class SurfCNN(PoseModule):
         ConfigError: `channels` and `kernels` differ in length, or a kernel is even.
     """
 
-    input_rank: ClassVar[int] = 2
+    input_ranks: ClassVar[tuple[int, ...]] = (2,)
 
     def __init__(
         self,

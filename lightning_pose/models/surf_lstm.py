@@ -33,7 +33,7 @@ class SurfLSTM(PoseModule):
         ConfigError: `layers` or `units` is not positive.
     """
 
-    input_rank: ClassVar[int] = 2
+    input_ranks: ClassVar[tuple[int, ...]] = (2,)
 
     def __init__(
         self,

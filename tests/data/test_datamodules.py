@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from lightning_pose.data import datamodules
-from lightning_pose.data.datamodules import ImageDataModule
+from lightning_pose.data.datamodules import ImageDataModule, base
 from lightning_pose.errors import ConfigError, DataError, ImageError
 from lightning_pose.features import ORB
 from lightning_pose.images import read_gray
@@ -104,7 +103,7 @@ def test_without_a_folder_a_room_is_rendered(monkeypatch: pytest.MonkeyPatch, tm
         return scene
 
     monkeypatch.setenv("LIGHTNING_POSE_CACHE", str(tmp_path))
-    monkeypatch.setattr(datamodules, "render_room", render)
+    monkeypatch.setattr(base, "render_room", render)
     data = ImageDataModule(Thumbnails(), room_seed=3, room_frames=50)
     assert asked == [], "not before it is needed"
     assert len(data.scene.frames) == 34

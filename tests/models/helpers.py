@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from lightning import LightningDataModule
 from torch import nn
@@ -11,15 +12,30 @@ from torch.utils.data import DataLoader
 
 from lightning_pose import models
 from lightning_pose.data.batches import PoseBatch, PoseDataset, batch_loader
+from lightning_pose.data.clips import ClipDataset, ClipShape
 from lightning_pose.models import PoseModule
 
-__all__ = ["ARCHITECTURES", "LearnableProblem", "SmallCNN", "make_model", "random_poses"]
+__all__ = [
+    "ARCHITECTURES",
+    "CLIP_LENGTH",
+    "ClipProblem",
+    "LearnableProblem",
+    "SmallCNN",
+    "features_for",
+    "make_model",
+    "problem_for",
+    "random_poses",
+]
 
 _INPUT_SHAPES = {1: [32], 2: [20, 64], 3: [16, 3, 4]}
 
+CLIP_LENGTH = 4
+
 _exported = [getattr(models, name) for name in models.__all__]
 ARCHITECTURES = [
-    cls for cls in _exported if isinstance(cls, type) and issubclass(cls, PoseModule) and cls is not PoseModule
+    cls
+    for cls in _exported
+    if isinstance(cls, type) and issubclass(cls, PoseModule) and cls not in (PoseModule, models.ClipModule)
 ]
 
 
@@ -29,7 +45,7 @@ def make_model(architecture: type[PoseModule], **settings: object) -> PoseModule
     if architecture is models.PoseNet:
         small = {"backbone": "tests.models.helpers.SmallCNN", "crop": 12, "input_shape": [3, 12, 12]}
     else:
-        small = {"input_shape": _INPUT_SHAPES[architecture.input_rank]}
+        small = {"input_shape": _INPUT_SHAPES[architecture.input_ranks[0]]}
     model = architecture(**{**small, **settings})  # type: ignore[arg-type]
     if isinstance(model, models.NodePose):
         model.remember(LearnableProblem(list(model.input_shape)).data.data)
@@ -58,6 +74,17 @@ def random_poses(count: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]
     return position_m, torch.cat([half_angle.cos(), half_angle.sin() * axis], dim=-1)
 
 
+def features_for(model: PoseModule, count: int, seed: int = 0) -> torch.Tensor:
+    """Random features of frames, or of clips where the model reads those."""
+    axes = (CLIP_LENGTH,) if isinstance(model, models.ClipModule) else ()
+    return torch.randn(count, *axes, *model.input_shape, generator=torch.Generator().manual_seed(seed))
+
+
+def problem_for(model: PoseModule) -> LearnableProblem:
+    """A problem that the model can learn, of clips where it reads those."""
+    return (ClipProblem if isinstance(model, models.ClipModule) else LearnableProblem)(list(model.input_shape))
+
+
 class LearnableProblem(LightningDataModule):
     """Frames whose features are the pose times a fixed random matrix, so that there is all to learn and no noise."""
 
@@ -69,9 +96,35 @@ class LearnableProblem(LightningDataModule):
         mix = torch.randn(7, math.prod(input_shape), generator=torch.Generator().manual_seed(1)) / 7**0.5
         features = (pose @ mix).reshape(count, *input_shape)
         self.data = PoseDataset(PoseBatch(features, position_m, quat_wxyz, torch.arange(count)))
+        self.learnt = self.data.data
 
     def dataset(self, split: str) -> PoseDataset:
         return self.data
 
     def train_dataloader(self) -> DataLoader[PoseBatch]:
         return batch_loader(self.data, batch_size=8, shuffle=True)
+
+
+class ClipProblem(LearnableProblem):
+    """Clips in which every frame shows where it is."""
+
+    relative_frame = "camera"
+
+    def __init__(self, input_shape: list[int], count: int = 24) -> None:
+        super().__init__(input_shape, count)
+        data = self.data.data
+        self.clips = ClipDataset(data, [np.arange(count)], ClipShape(CLIP_LENGTH, hop=1))
+        # What a frame shows is its pose relative to the first frame of its clip, as it is to be told.
+        _, position_m, quat_wxyz, frame = self.clips.__getitems__(range(len(self.clips)))
+        rows, columns = input_shape
+        # In patches, because the networks' pools are averages.
+        mix = torch.randn(7, -(-rows // 5), -(-columns // 5), generator=torch.Generator().manual_seed(1))
+        mix = mix.repeat_interleave(5, 1).repeat_interleave(5, 2)[:, :rows, :columns]
+        features = torch.einsum("wtp,prc->wtrc", torch.cat([position_m, quat_wxyz], dim=-1), mix)
+        self.learnt = PoseBatch(features, position_m, quat_wxyz, frame)
+
+    def dataset(self, split: str) -> ClipDataset:  # type: ignore[override]
+        return self.clips
+
+    def train_dataloader(self) -> DataLoader[PoseBatch]:
+        return batch_loader(PoseDataset(self.learnt), batch_size=8, shuffle=True)

@@ -13,16 +13,17 @@ from lightning_pose.data.batches import PoseBatch
 from lightning_pose.errors import ConfigError
 from lightning_pose.geometry import orientation_error_deg, position_error_m
 from lightning_pose.losses import LossConfig
-from lightning_pose.models import PoseModule
+from lightning_pose.models import ClipModule, PoseModule
 from lightning_pose.spec import build
-from tests.models.helpers import ARCHITECTURES, LearnableProblem, make_model, random_poses
+from tests.models.helpers import ARCHITECTURES, CLIP_LENGTH, features_for, make_model, problem_for, random_poses
 
 Architecture = type[PoseModule]
 every_architecture = pytest.mark.parametrize("architecture", ARCHITECTURES, ids=lambda cls: cls.__name__)
 
 
-def features_for(model: PoseModule, count: int) -> torch.Tensor:
-    return torch.randn(count, *model.input_shape, generator=torch.Generator().manual_seed(0))
+def frames_of(model: PoseModule, count: int) -> tuple[int, ...]:
+    """(B,) frames, or (B, T) where the model reads clips."""
+    return (count, CLIP_LENGTH) if isinstance(model, ClipModule) else (count,)
 
 
 @every_architecture
@@ -31,15 +32,15 @@ def test_poses_have_their_shape_and_unit_quaternions(architecture: Architecture,
     model = make_model(architecture, standardize=standardize).eval()
     model.fit_scale(*random_poses(10))
     position_m, quat_wxyz = model(features_for(model, 5))
-    assert position_m.shape == (5, 3)
-    assert quat_wxyz.shape == (5, 4)
-    torch.testing.assert_close(quat_wxyz.norm(dim=-1), torch.ones(5))
+    assert position_m.shape == (*frames_of(model, 5), 3)
+    assert quat_wxyz.shape == (*frames_of(model, 5), 4)
+    torch.testing.assert_close(quat_wxyz.norm(dim=-1), torch.ones(frames_of(model, 5)))
 
 
 @every_architecture
 def test_a_blank_image_has_a_finite_pose(architecture: Architecture) -> None:
     model = make_model(architecture).eval()
-    pose = model(torch.zeros(1, *model.input_shape))
+    pose = model(torch.zeros_like(features_for(model, 1)))
     assert all(tensor.isfinite().all() for tensor in pose)
 
 
@@ -56,7 +57,9 @@ def test_every_parameter_gets_a_finite_gradient(architecture: Architecture, monk
     if not model.automatic_optimization:
         pytest.skip("solved in closed form")
     monkeypatch.setattr(model, "log_dict", lambda *args, **kwargs: None)
-    model.training_step(PoseBatch(features_for(model, 8), *random_poses(8), torch.arange(8)), 0).backward()
+    poses = (pose.expand(*frames_of(model, 8)[1:], *pose.shape) for pose in random_poses(8))
+    poses = (pose.movedim(-2, 0) for pose in poses)
+    model.training_step(PoseBatch(features_for(model, 8), *poses, torch.arange(8)), 0).backward()
     for name, parameter in model.named_parameters():
         assert parameter.grad is not None, name
         assert parameter.grad.isfinite().all(), name
@@ -82,7 +85,7 @@ def test_a_checkpoint_rebuilds_the_same_model(architecture: Architecture) -> Non
 
 @every_architecture
 def test_features_of_another_rank_are_refused(architecture: Architecture) -> None:
-    shape = [3] * (architecture.input_rank + 1)
+    shape = [3] * (architecture.input_ranks[-1] + 1)
     with pytest.raises(ConfigError, match=rf"{architecture.__name__} .*\(3, 3.*choose another data.extractor"):
         architecture(input_shape=shape)
 
@@ -95,9 +98,9 @@ def test_a_run_has_a_headline(architecture: Architecture) -> None:
 @every_architecture
 def test_it_learns_what_can_be_learnt(architecture: Architecture) -> None:
     model = make_model(architecture, loss=LossConfig(orientation_weight=5.0))
-    problem = LearnableProblem(list(model.input_shape))
+    problem = problem_for(model)
     trainer = Trainer(
-        max_epochs=25,
+        max_epochs=100 if isinstance(model, ClipModule) else 25,
         accelerator="cpu",
         logger=False,
         enable_checkpointing=False,
@@ -105,10 +108,10 @@ def test_it_learns_what_can_be_learnt(architecture: Architecture) -> None:
         enable_model_summary=False,
     )
     trainer.fit(model, datamodule=problem)
-    data = problem.data.data
+    data = problem.learnt
     with torch.inference_mode():
         position_m, quat_wxyz = model.eval()(data.features)
-    mean_pose_error = position_error_m(data.position_m.mean(0), data.position_m).median()
+    mean_pose_error = position_error_m(data.position_m.flatten(0, -2).mean(0), data.position_m).median()
     assert position_error_m(position_m, data.position_m).median() < mean_pose_error / 3
     upright = torch.tensor([1.0, 0.0, 0.0, 0.0])
     turned = orientation_error_deg(upright, data.quat_wxyz).median()

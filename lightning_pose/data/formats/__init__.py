@@ -23,7 +23,11 @@ def known_formats() -> dict[str, SceneFormat]:
 
 
 def load_scene(
-    root: Path | str, format: str | None = None, val_fraction: float = 0.1, test_fraction: float = 0.2
+    root: Path | str,
+    format: str | None = None,
+    val_fraction: float = 0.1,
+    test_fraction: float = 0.2,
+    val_block: int = 1,
 ) -> Scene:
     """Read a folder of posed images.
 
@@ -32,6 +36,7 @@ def load_scene(
         format: name of its format; recognised from the files where it is None.
         val_fraction: part of the training frames to validate on, see `splits`; 0 for none.
         test_fraction: part of all frames to test on, where the format has no official split.
+        val_block: validation frames come in runs of this many at least, where sequences are that long.
 
     Returns:
         the scene with `train`, `val` and `test`; no image has been decoded.
@@ -45,7 +50,7 @@ def load_scene(
         raise DataError(f"{root} is not a folder; give the folder of a scene")
     scene = _format(root, format).read(root)
     source = "official" if scene.splits else "blocks"
-    return replace(scene, splits=make_splits(scene, val_fraction, test_fraction), split_source=source)
+    return replace(scene, splits=make_splits(scene, val_fraction, test_fraction, val_block), split_source=source)
 
 
 def _format(root: Path, name: str | None) -> SceneFormat:

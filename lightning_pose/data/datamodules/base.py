@@ -1,8 +1,8 @@
-"""The data module for single images: Scene -> cached features -> batches."""
+"""SceneDataModule: what the data modules share, from the scene to the features of a split in memory."""
 
 from __future__ import annotations
 
-from copy import copy
+from abc import abstractmethod
 from pathlib import Path
 from typing import Any
 
@@ -11,36 +11,36 @@ import torch
 from lightning import LightningDataModule
 from torch.utils.data import DataLoader
 
-from lightning_pose.data.batches import DrawnDataset, PoseBatch, PoseDataset, batch_loader
-from lightning_pose.data.formats import load_scene
+from lightning_pose.data.batches import PoseBatch, PoseDataset, batch_loader
 from lightning_pose.data.scene import Scene
 from lightning_pose.data.synthetic import RENDERER_VERSION, render_room
 from lightning_pose.errors import ConfigError, DataError
-from lightning_pose.features import FeatureCache, FeatureExtractor, LocalExtractor
+from lightning_pose.features import FeatureCache, FeatureExtractor
 from lightning_pose.features.cache import FillReport
 from lightning_pose.folders import cache_folder
 from lightning_pose.spec import describe
 
-__all__ = ["ImageDataModule"]
+__all__ = ["SceneDataModule", "room_folder"]
 
 
-class ImageDataModule(LightningDataModule):
-    """Single posed images of one scene, as features.
+def room_folder(seed: int, frames: int) -> Path:
+    """The synthetic room of that seed in the user's cache, rendered on first use."""
+    folder = cache_folder("rooms") / f"room-{seed}-{frames}-v{RENDERER_VERSION}"
+    return render_room(folder, seed, frames)
+
+
+class SceneDataModule(LightningDataModule):
+    """Scene -> cached features -> batches.
+
+    A child gives `_load_scene`, `train_dataloader`, and `_make_dataset` where a split is more than its frames. It
+    keeps every constructor argument as an attribute of the same name.
 
     Args:
         extractor: what the networks read, such as `lightning_pose.features.SURF`.
-        root: the scene's folder; none renders the synthetic room on first use.
-        format: name of the dataset format; recognised from the folder if not given.
-        val_fraction: part of the training split kept for validation, in whole blocks of the trajectory; 0 for none.
-        batch_size: frames in a training batch.
-        eval_batch_size: frames in a batch where no gradient is needed.
-        feature_pool: in training, draw the features of each frame at random from this many of its strongest, anew
-            in every epoch, so that no frame is known by heart; validation and test read the strongest. None never
-            draws. For extractors of local features only, and at most the 300 that the cache holds, or N.
+        batch_size: items in a training batch.
+        eval_batch_size: items in a batch where no gradient is needed.
         cache_dir: where extracted features are kept; the user's cache folder if not given.
         workers: processes or threads that extract features; every core if not given.
-        room_seed: which synthetic room.
-        room_frames: how many frames of it.
 
     Raises:
         ConfigError: a number is out of its range.
@@ -50,36 +50,27 @@ class ImageDataModule(LightningDataModule):
     def __init__(
         self,
         extractor: FeatureExtractor,
-        root: str | None = None,
-        format: str | None = None,
-        val_fraction: float = 0.1,
-        batch_size: int = 64,
-        eval_batch_size: int = 256,
-        feature_pool: int | None = None,
-        cache_dir: str | None = None,
-        workers: int | None = None,
-        room_seed: int = 0,
-        room_frames: int = 300,
+        batch_size: int,
+        eval_batch_size: int,
+        cache_dir: str | None,
+        workers: int | None,
     ) -> None:
         super().__init__()
         for name, value in (("batch_size", batch_size), ("eval_batch_size", eval_batch_size)):
             if value < 1:
-                raise ConfigError(f"data.{name} is {value}; give 1 or more frames")
+                raise ConfigError(f"data.{name} is {value}; give 1 or more")
         self.extractor = extractor
-        self.root = root
-        self.format = format
-        self.val_fraction = val_fraction
         self.batch_size = batch_size
         self.eval_batch_size = eval_batch_size
-        self.feature_pool = feature_pool
-        self._pool = None if feature_pool is None else _pooled(extractor, feature_pool)
         self.cache_dir = cache_dir
         self.workers = workers
-        self.room_seed = room_seed
-        self.room_frames = room_frames
         self.cache = FeatureCache(extractor, cache_dir)
         self._scene: Scene | None = None
-        self._datasets: dict[str, PoseDataset] = {}
+        self._datasets: dict[str, Any] = {}
+
+    @abstractmethod
+    def _load_scene(self) -> Scene:
+        """Read the scene, or render it."""
 
     @property
     def input_shape(self) -> tuple[int, ...]:
@@ -90,26 +81,25 @@ class ImageDataModule(LightningDataModule):
     def scene(self) -> Scene:
         """The scene, read (or rendered) on first use."""
         if self._scene is None:
-            root = Path(self.root) if self.root is not None else self._room()
-            self._scene = load_scene(root, self.format, self.val_fraction)
+            self._scene = self._load_scene()
         return self._scene
-
-    def _room(self) -> Path:
-        folder = cache_folder("rooms") / f"room-{self.room_seed}-{self.room_frames}-v{RENDERER_VERSION}"
-        return render_room(folder, self.room_seed, self.room_frames)
 
     def prepare_data(self) -> None:
         self.fill()
 
     def fill(self) -> FillReport:
         """Extract what the cache lacks, for every split."""
-        return self.cache.fill([frame.image for frame in self.scene.frames], workers=self.workers)
+        used = sorted({int(i) for indices in self.scene.splits.values() for i in indices})
+        return self.cache.fill([self.scene.frames[i].image for i in used], workers=self.workers)
 
-    def dataset(self, split: str) -> PoseDataset:
-        """One of `train`, `val`, `test`, its features in memory."""
+    def dataset(self, split: str) -> Any:
+        """One of `train`, `val`, `test`, its features in memory; `data` holds them frame by frame."""
         if split not in self._datasets:
-            self._datasets[split] = PoseDataset(self._read(split, self.cache))
+            self._datasets[split] = self._make_dataset(split, self._read(split, self.cache))
         return self._datasets[split]
+
+    def _make_dataset(self, split: str, data: PoseBatch) -> Any:
+        return PoseDataset(data)
 
     def _read(self, split: str, cache: FeatureCache) -> PoseBatch:
         frames = [self.scene.frames[i] for i in self.scene.splits[split]]
@@ -119,13 +109,6 @@ class ImageDataModule(LightningDataModule):
             quat_wxyz=_stack([frame.quat_wxyz for frame in frames], 4),
             frame=torch.as_tensor(self.scene.splits[split], dtype=torch.int64),
         )
-
-    def train_dataloader(self) -> DataLoader[PoseBatch]:
-        train = self.dataset("train")
-        if self._pool is not None:
-            pool = self._read("train", FeatureCache(self._pool, self.cache_dir))
-            train = DrawnDataset(pool, self.input_shape[0])
-        return batch_loader(train, self.batch_size, shuffle=True)
 
     def val_dataloader(self) -> DataLoader[PoseBatch] | list[Any]:
         if len(self.scene.splits["val"]):
@@ -149,19 +132,6 @@ class ImageDataModule(LightningDataModule):
         spec = describe(self)
         spec["init_args"]["extractor"] = describe(self.extractor)
         return spec
-
-
-def _pooled(extractor: FeatureExtractor, feature_pool: int) -> LocalExtractor:
-    """The extractor with `feature_pool` features a frame, out of the same cache."""
-    if not isinstance(extractor, LocalExtractor):
-        raise ConfigError(f"data.feature_pool needs local features, and {extractor.name} has none; leave it out")
-    if not extractor.n_features <= feature_pool <= extractor.n_stored:
-        raise ConfigError(
-            f"data.feature_pool is {feature_pool}; give {extractor.n_features} (n_features) to {extractor.n_stored}"
-        )
-    pooled = copy(extractor)
-    pooled.n_features = feature_pool
-    return pooled
 
 
 def _stack(rows: list[np.ndarray], width: int) -> torch.Tensor:

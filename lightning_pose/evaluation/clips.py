@@ -1,0 +1,227 @@
+"""How a model of clips is judged: by clip length and over whole sequences, against standing still and odometry."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import torch
+from lightning import LightningModule, Trainer
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from lightning_pose import clip_plots
+from lightning_pose.clip_baselines import constant_velocity, no_motion
+from lightning_pose.data.clips import ClipDataset
+from lightning_pose.data.scene import Frame
+from lightning_pose.evaluation.base import Evaluation, costs, skill
+from lightning_pose.geometry import orientation_error_deg, position_error_m, quat_rotate
+from lightning_pose.models.base import Pose
+from lightning_pose.models.clip import ClipModule, layer_responses
+from lightning_pose.relative import absolute_poses, relative_poses
+from lightning_pose.sequences import locate_sequence
+from lightning_pose.summary import summarize_errors
+from lightning_pose.trajectories import drift_by_length, mean_over_sequences, trajectory_errors
+from lightning_pose.visual_odometry import visual_odometry
+
+__all__ = ["LENGTHS", "evaluate_clips"]
+
+LENGTHS = (2, 5, 10, 20, 50, 100, 200, 400)
+"""Frames of the clips that errors are told for, as far as sequences go (thesis, fig. 6.4)."""
+
+_FRAMES = 512  # in a batch, whatever the length of its clips
+_BY_LENGTH = ("position_median_m", "orientation_median_deg")
+
+
+class Sequence(NamedTuple):
+    """A run of test frames, and where they are said to be: world poses, float64, all from the true first one."""
+
+    rows: Tensor
+    """(M,) rows of the test split's data."""
+    frames: list[Frame]
+    truth: Pose
+    systems: dict[str, Pose]
+    """The model's name, and `visual_odometry` where it ran."""
+    failed_steps: int
+    """Of visual odometry, which stands still where images do not match."""
+
+
+def evaluate_clips(
+    trainer: Trainer, module: ClipModule, model: Mapping[str, float], odometry: bool = True
+) -> Evaluation:
+    """Judge a test of clips: other lengths are cut than the test's own, and whole sequences chained.
+
+    Args:
+        trainer: after the test.
+        module: the model.
+        model: the model's metrics over clips of the data's own length.
+        odometry: match images for visual odometry.
+    """
+    datamodule = trainer.datamodule  # type: ignore[attr-defined]
+    name = type(module.eval()).__name__
+    sequences = _locate(datamodule, module, odometry)
+    lengths = sorted({n for n in (*LENGTHS, datamodule.clip_length) if n <= datamodule.longest_clip("test")})
+    found = {n: _judge_length(datamodule, module, sequences, n) for n in lengths}
+    baselines = {system: m for system, m in found[datamodule.clip_length].items() if system != name}
+    tracked = _tracked(sequences)
+    curves = {
+        f"{_prefix(system, name)}/{metric}_by_length": {n: found[n][system][metric] for n in lengths}
+        for system in found[lengths[0]]
+        for metric in _BY_LENGTH
+    }
+    extras = skill(model, baselines["no_motion"]) | costs(trainer, module, datamodule.clip_length)
+    for system, metrics in tracked.items():
+        extras |= {f"{_prefix(system, name)}/{metric}": value for metric, value in metrics.items()}
+    if odometry:
+        extras["baseline/visual_odometry/failed_steps"] = float(sum(sequence.failed_steps for sequence in sequences))
+    figures = _figures(datamodule, name, sequences, found)
+    if len(module.input_shape) == 3:
+        figures["responses"] = _responses(datamodule, module)
+    return Evaluation(
+        baselines=baselines,
+        extras=extras,
+        trajectories=_files(sequences, name),
+        figures=figures,
+        curves=curves | _drift(sequences, name, lengths),
+    )
+
+
+def _prefix(system: str, model: str) -> str:
+    return "test" if system == model else f"baseline/{system}"
+
+
+def _locate(datamodule: Any, module: ClipModule, odometry: bool) -> list[Sequence]:
+    """Chain clips over every run of test frames that holds two."""
+    test: ClipDataset = datamodule.dataset("test")
+    scene, data = datamodule.scene, test.data
+    runs = [torch.from_numpy(run[:: datamodule.stride]) for run in test.runs]
+    found = []
+    for rows in (rows for rows in runs if len(rows) > 1):
+        frames = [scene.frames[i] for i in data.frame[rows].tolist()]
+        truth = Pose(data.position_m[rows].double(), data.quat_wxyz[rows].double())
+        start = truth.position_m[0], truth.quat_wxyz[0]
+        chained = locate_sequence(
+            module, data.features[rows], datamodule.clip_length, datamodule.relative_frame, *start
+        )
+        systems, failed = {type(module).__name__: Pose(*chained)}, 0
+        if odometry:
+            motion = visual_odometry(frames, torch.arange(len(frames))[None])
+            failed = motion.failed_steps
+            systems["visual_odometry"] = Pose(*absolute_poses(motion.position_m[0], motion.quat_wxyz[0], *start))
+        found.append(Sequence(rows, frames, truth, systems, failed))
+    return found
+
+
+def _judge_length(
+    datamodule: Any, module: ClipModule, sequences: list[Sequence], length: int
+) -> dict[str, dict[str, float]]:
+    """Metrics of the model, first, and of every baseline on clips of one length, first frames left out."""
+    clips: ClipDataset = datamodule.clips("test", length)
+    truth = Pose(*(part.double() for part in clips.targets()))
+    count = len(clips)
+    train = datamodule.dataset("train").targets()
+    velocity = constant_velocity(*train, length, datamodule.relative_frame)
+    answers = {
+        type(module).__name__: _answer(module, clips),
+        "no_motion": Pose(*no_motion(count, length)),
+        "constant_velocity": Pose(velocity[0].expand(count, -1, 3), velocity[1].expand(count, -1, 4)),
+    }
+    if "visual_odometry" in sequences[0].systems:
+        answers["visual_odometry"] = _odometry(sequences, clips)
+    return {system: _summary(answer, truth) for system, answer in answers.items()}
+
+
+def _answer(module: ClipModule, clips: ClipDataset) -> Pose:
+    """The model's poses of all clips, (W, T, 3) and (W, T, 4)."""
+    size = max(1, _FRAMES // clips.shape.length)
+    poses = []
+    with torch.inference_mode():
+        for start in range(0, len(clips), size):
+            batch = clips.__getitems__(range(start, min(start + size, len(clips))))
+            poses.append(module(batch.features.to(module.device)))
+    return Pose(*(torch.cat(parts).double().cpu() for parts in zip(*poses, strict=True)))
+
+
+def _odometry(sequences: list[Sequence], clips: ClipDataset) -> Pose:
+    """Visual odometry's poses of all clips; in world axes it is told each clip's first orientation."""
+    rows = torch.cat([sequence.rows for sequence in sequences])
+    place = torch.full((int(rows.max()) + 1,), -1)
+    place[rows] = torch.arange(len(rows))
+    poses = (torch.cat(parts) for parts in zip(*(s.systems["visual_odometry"] for s in sequences), strict=True))
+    position_m, quat_wxyz = (part[place[clips.rows()]] for part in poses)
+    moved, turned = relative_poses(position_m, quat_wxyz)
+    if clips.relative_frame == "world":
+        moved = quat_rotate(clips.data.quat_wxyz[clips.rows()[:, :1]].double(), moved)
+    return Pose(moved, turned)
+
+
+def _summary(answer: Pose, truth: Pose) -> dict[str, float]:
+    positions, quats = ([part[:, 1:] for part in pair] for pair in zip(answer, truth, strict=True))
+    return summarize_errors(position_error_m(*positions), orientation_error_deg(*quats))
+
+
+def _tracked(sequences: list[Sequence]) -> dict[str, dict[str, float]]:
+    """ATE and RPE of each system, the mean over sequences."""
+    return {
+        system: mean_over_sequences(
+            {str(i): trajectory_errors(*s.systems[system], *s.truth) for i, s in enumerate(sequences)}
+        )
+        for system in sequences[0].systems
+    }
+
+
+def _drift(sequences: list[Sequence], name: str, lengths: list[int]) -> dict[str, dict[int, float]]:
+    """Error at the end of sub-trajectories by their number of frames, the mean over sequences that are long enough."""
+    curves: dict[str, dict[int, float]] = {}
+    for system in sequences[0].systems:
+        drifts = [drift_by_length(*s.systems[system], *s.truth, [n - 1 for n in lengths]) for s in sequences]
+        for part in ("position_m", "orientation_deg", "percent"):
+            values = torch.tensor([getattr(drift, part).tolist() for drift in drifts]).nanmean(0)
+            told = {n: float(value) for n, value in zip(lengths, values, strict=True) if not value.isnan()}
+            curves[f"{_prefix(system, name)}/drift_{part}_by_length"] = told
+    return curves
+
+
+def _figures(
+    datamodule: Any, name: str, sequences: list[Sequence], found: Mapping[int, Mapping[str, Mapping[str, float]]]
+) -> dict[str, Figure]:
+    scene = datamodule.scene
+    shown = {_title(s, i): s for i, s in enumerate(sequences)}
+    lengths = list(found)
+    errors = {
+        system: tuple([found[n][system][metric] for n in lengths] for metric in _BY_LENGTH)
+        for system in found[lengths[0]]
+    }
+    return {
+        "trajectory": clip_plots.relative_trajectories(
+            {title: s.truth.position_m.numpy() for title, s in shown.items()},
+            {title: s.systems[name].position_m.numpy() for title, s in shown.items()},
+            title=f"{name} on {scene.name}, chained from the start",
+            unit=scene.unit,
+        ),
+        "error_by_length": clip_plots.error_by_length(
+            lengths, errors, title=f"{name} on {scene.name}", unit=scene.unit
+        ),
+    }
+
+
+def _title(sequence: Sequence, number: int) -> str:
+    """A sequence's name, with the number of the run: a sequence with gaps has several."""
+    return f"{sequence.frames[0].sequence} #{number + 1}"
+
+
+def _responses(datamodule: Any, module: LightningModule) -> Figure:
+    """What the first two layers make of the first test clip, of its middle frame."""
+    clip = datamodule.dataset("test")[0].features
+    middle = len(clip) // 2
+    layers = {name: list(out[middle].numpy()) for name, out in layer_responses(module, clip).items()}  # type: ignore[arg-type]
+    images = [image.permute(1, 2, 0).numpy() for image in clip]
+    return clip_plots.responses(images, layers, title=f"What {type(module).__name__} responds to")
+
+
+def _files(sequences: list[Sequence], name: str) -> dict[str, tuple[list[Frame], Pose]]:
+    frames = [frame for s in sequences for frame in s.frames]
+    parts = {"truth": [s.truth for s in sequences], "predictions": [s.systems[name] for s in sequences]}
+    return {
+        kind: (frames, Pose(*(torch.cat(part) for part in zip(*poses, strict=True)))) for kind, poses in parts.items()
+    }

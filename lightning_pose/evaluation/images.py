@@ -1,0 +1,83 @@
+"""How a model of single images is judged: against the mean pose, image retrieval and its oracle."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from lightning import LightningModule, Trainer
+from matplotlib.figure import Figure
+
+from lightning_pose import plots
+from lightning_pose.baselines import BaselineResult, evaluate_baselines
+from lightning_pose.data.batches import PoseBatch
+from lightning_pose.data.scene import Scene
+from lightning_pose.evaluation.base import Evaluation, costs, skill
+from lightning_pose.geometry import orientation_error_deg, position_error_m
+from lightning_pose.models.base import Pose
+
+__all__ = ["evaluate_images"]
+
+
+def evaluate_images(
+    trainer: Trainer, module: LightningModule, outputs: list[Pose], model: Mapping[str, float]
+) -> Evaluation:
+    """Judge a test of single images.
+
+    Args:
+        trainer: after the test.
+        module: the model.
+        outputs: poses of each batch.
+        model: its metrics.
+    """
+    datamodule = trainer.datamodule  # type: ignore[attr-defined]
+    scene: Scene = datamodule.scene
+    train, test = (datamodule.dataset(split).data for split in ("train", "test"))
+    prediction = Pose(*(torch.cat(parts) for parts in zip(*outputs, strict=True)))
+    appearance = datamodule.extractor.appearance
+    baselines = evaluate_baselines(
+        appearance(train.features),
+        train.position_m,
+        train.quat_wxyz,
+        appearance(test.features),
+        test.position_m,
+        test.quat_wxyz,
+    )
+    name = type(module).__name__
+    poses = {name: Pose(*(tensor.double() for tensor in prediction)), **baselines}
+    frames = [scene.frames[i] for i in test.frame.tolist()]
+    metrics = {system: result.metrics for system, result in baselines.items()}
+    return Evaluation(
+        baselines=metrics,
+        extras=skill(model, metrics["retrieval_top1"]) | costs(trainer, module),
+        trajectories={"truth": (frames, Pose(test.position_m, test.quat_wxyz)), "predictions": (frames, prediction)},
+        figures=_figures(scene, name, train, test, poses),
+    )
+
+
+def _figures(
+    scene: Scene, name: str, train: PoseBatch, test: PoseBatch, poses: Mapping[str, Pose | BaselineResult]
+) -> dict[str, Figure]:
+    """The run's figures by file name; `poses` has the model's first, then the baselines'."""
+    frames = [scene.frames[i] for i in test.frame.tolist()]
+    errors = {
+        system: (
+            position_error_m(pose.position_m, test.position_m.double()).numpy(),
+            orientation_error_deg(pose.quat_wxyz, test.quat_wxyz.double()).numpy(),
+        )
+        for system, pose in poses.items()
+    }
+    model = errors.pop(name)
+    about = f"{name} on {scene.name}"
+    return {
+        "trajectory": plots.trajectory(
+            test.position_m.numpy(),
+            poses[name].position_m.numpy(),
+            [frame.sequence for frame in frames],
+            train.position_m.numpy(),
+            title=about,
+            unit=scene.unit,
+        ),
+        "cumulative_errors": plots.cumulative_errors(model, errors, name, title=about, unit=scene.unit),
+        "error_vs_distance": plots.error_vs_distance(model[0], errors["oracle"][0], title=about, unit=scene.unit),
+    }

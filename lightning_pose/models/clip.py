@@ -1,0 +1,153 @@
+"""ClipModule: what the architectures for clips share."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from lightning_pose.data.batches import PoseBatch
+from lightning_pose.errors import ConfigError
+from lightning_pose.geometry import quat_normalize, relative_pose
+from lightning_pose.models.base import Pose, PoseModule
+from lightning_pose.models.motion import GEOMETRY_COLUMNS, MOTION_COLUMNS, matched_motion
+from lightning_pose.relative import chain_steps
+
+__all__ = ["ClipModule", "layer_responses"]
+
+
+class ClipModule(PoseModule):
+    """Base of the architectures that read clips (B, T, *input_shape), any T, and say where each frame is.
+
+    Poses are relative to the clip's first frame (eq. 6.1), (B, T, 3) and (B, T, 4). `self.network` takes (B, T, C, H,
+    W) and returns (B, T, 7); descriptors (N, D) are an image of one channel to it, raw images have three. Metrics
+    leave out the first frame, whose pose is known.
+
+    Args:
+        integrate: let the network say each frame's pose relative to the frame before it, and compose them. The
+            thesis's networks say the pose relative to the first frame at once, which a frame and its neighbours in
+            time do not show. For `data.relative_frame: camera`.
+        motion: let the network read where features moved since the frame before (`matched_motion`), not what they
+            look like. The descriptors of a new scene say nothing of motion, and their order even less. For
+            descriptors `with_geometry`.
+        **kwargs: what `PoseModule` takes.
+
+    Raises:
+        ConfigError: `motion` without geometry; in `fit`, `integrate` where relative positions are in world axes.
+    """
+
+    input_ranks: ClassVar[tuple[int, ...]] = (2, 3)
+
+    motion_scale: Tensor
+
+    def __init__(self, integrate: bool = False, motion: bool = False, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.integrate = integrate
+        self.motion = motion
+        if motion and (len(self.input_shape) != 2 or self.input_shape[1] <= GEOMETRY_COLUMNS):
+            raise ConfigError(
+                f"model.motion needs descriptors with their places, not features of shape {self.input_shape}; "
+                "give local features with_geometry: true as data.extractor"
+            )
+        self.register_buffer("motion_scale", torch.ones(MOTION_COLUMNS))
+
+    @property
+    def feature_axis(self) -> int:  # type: ignore[override]
+        """Columns of descriptors, channels of images."""
+        return -3 if len(self.input_shape) == 3 else -1
+
+    @property
+    def image_shape(self) -> tuple[int, int, int]:
+        """Channels, height and width of a frame, as the network sees it."""
+        if self.motion:
+            return MOTION_COLUMNS, self.input_shape[0], 1  # a filter sees all that is known of a move
+        channels, height, width = (1, *self.input_shape)[-3:]
+        return channels, height, width
+
+    @property
+    def headline(self) -> str:
+        shape = "x".join(map(str, self.input_shape))
+        return shape + " motion" * self.motion + " integrated" * self.integrate
+
+    def setup(self, stage: str) -> None:
+        super().setup(stage)
+        if stage != "fit":
+            return
+        datamodule = self.trainer.datamodule  # type: ignore[attr-defined]
+        if self.motion:
+            self._fit_motion_scale(datamodule.dataset("train"))
+        frame = datamodule.relative_frame
+        if self.integrate and frame != "camera":
+            raise ConfigError(
+                f"model.integrate composes camera motions, but data.relative_frame is {frame}; set camera"
+            )
+
+    def _fit_motion_scale(self, train: Any) -> None:
+        """Learn how far features move, from some training clips."""
+        chosen = range(0, len(train), -(-len(train) // 64))
+        rows = matched_motion(train.__getitems__(chosen).features).flatten(0, 2)
+        rows = rows[rows.any(1)]
+        if len(rows) > 1:
+            self.motion_scale.copy_(rows.square().mean(0).sqrt().clamp(min=1e-6))
+
+    def _training_poses(self, train: Any) -> tuple[Tensor, Tensor]:
+        position_m, quat_wxyz = train.targets()
+        if self.integrate:
+            before = position_m[:, :-1], quat_wxyz[:, :-1]
+            position_m, quat_wxyz = relative_pose(*before, position_m[:, 1:], quat_wxyz[:, 1:])
+        else:
+            position_m, quat_wxyz = position_m[:, 1:], quat_wxyz[:, 1:]
+        return position_m.flatten(0, 1), quat_wxyz.flatten(0, 1)
+
+    def _decode(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        if self.motion:
+            read = (matched_motion(features) / self.motion_scale).transpose(2, 3)
+        else:
+            read = self._standardized(features)
+        images = read.reshape(*features.shape[:2], *self.image_shape)
+        position_m, quat_raw = self._unscaled(self.network(images))
+        if self.integrate:
+            return chain_steps(position_m[:, 1:], quat_normalize(quat_raw[:, 1:]))
+        return position_m, quat_raw
+
+    def _judged(self, pose: Pose) -> Pose:
+        return Pose(pose.position_m[:, 1:], pose.quat_wxyz[:, 1:])
+
+    def predict_step(self, batch: PoseBatch, batch_idx: int) -> tuple[Tensor, Tensor, Tensor]:  # type: ignore[override]
+        """Frames (B, T) and their poses, for chaining."""
+        return batch.frame, *self(batch.features)
+
+
+@torch.no_grad()
+def layer_responses(model: ClipModule, clip: Tensor, layers: int = 2) -> dict[str, Tensor]:
+    """What the first convolutions of a network answer to one clip (thesis, fig. 6.5).
+
+    Args:
+        model: in any mode.
+        clip: (T, *input_shape).
+        layers: how many convolutions.
+
+    Returns:
+        `convolution 1`, `activation 1`, ...: (T, channels, height, width) each.
+    """
+    found: dict[str, Tensor] = {}
+    handles = []
+    for kind, name in (((nn.Conv2d, nn.Conv3d), "convolution"), ((nn.ReLU,), "activation")):
+        chosen = [module for module in model.network.modules() if isinstance(module, kind)][:layers]
+        for number, module in enumerate(chosen, 1):
+
+            def keep(_: nn.Module, __: Any, out: Tensor, name: str = f"{name} {number}") -> None:
+                # Conv3d answers (1, C, T, H, W), Conv2d over frames (T, C, H, W).
+                found[name] = (out[0].transpose(0, 1) if out.ndim == 5 else out).clone().cpu()
+
+            handles.append(module.register_forward_hook(keep))
+    training = model.training
+    try:
+        model.eval()(clip[None].to(model.device))
+    finally:
+        model.train(training)
+        for handle in handles:
+            handle.remove()
+    order = [f"{name} {number}" for number in range(1, layers + 1) for name in ("convolution", "activation")]
+    return {name: found[name] for name in order if name in found}
