@@ -119,8 +119,8 @@ def _judge_length(
     clips: ClipDataset = datamodule.clips("test", length)
     truth = Pose(*(part.double() for part in clips.targets()))
     count = len(clips)
-    train = datamodule.dataset("train").targets()
-    velocity = constant_velocity(*train, length, datamodule.relative_frame)
+    position_m, quat_wxyz = datamodule.dataset("train").targets()
+    velocity = constant_velocity(position_m, quat_wxyz, length, datamodule.relative_frame)
     answers = {
         type(module).__name__: _answer(module, clips),
         "no_motion": Pose(*no_motion(count, length)),
@@ -189,7 +189,7 @@ def _figures(
     shown = {_title(s, i): s for i, s in enumerate(sequences)}
     lengths = list(found)
     errors = {
-        system: tuple([found[n][system][metric] for n in lengths] for metric in _BY_LENGTH)
+        system: ([found[n][system][_BY_LENGTH[0]] for n in lengths], [found[n][system][_BY_LENGTH[1]] for n in lengths])
         for system in found[lengths[0]]
     }
     return {

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lightning_pose.data.scene import Frame, Scene
-from lightning_pose.data.splits import make_splits
+from lightning_pose.data.splits import hold_out, make_splits
 from lightning_pose.errors import ConfigError, DataError
 
 
@@ -92,3 +92,22 @@ def test_fraction_that_leaves_nothing() -> None:
 def test_no_frames() -> None:
     with pytest.raises(DataError, match=r"room holds no posed image; check"):
         make_splits(scene([]), 0.1, 0.2)
+
+
+@pytest.mark.parametrize(("block", "runs"), [(1, 4), (25, 4), (26, 2), (50, 2)])
+def test_validation_comes_in_runs_of_a_block(block: int, runs: int) -> None:
+    """13 sequences of 50 frames: halves serve as long as a block fits one, then whole sequences."""
+    sequences = np.repeat([f"seq-{i:02d}" for i in range(13)], 50)
+    kept, held = hold_out(np.arange(650), sequences, 0.1, "val_fraction", block)
+    assert sorted([*kept, *held]) == list(range(650))
+    parts = np.split(held, np.flatnonzero(np.diff(held) > 1) + 1)
+    assert len(parts) == runs
+    assert min(map(len, parts)) >= block
+    assert all(len(set(sequences[part])) == 1 for part in parts)
+
+
+def test_blocks_of_one_trajectory_are_long_enough() -> None:
+    kept, held = hold_out(np.arange(300), np.full(300, "one"), 0.1, "val_fraction", 50)
+    assert len(held) == 50
+    assert len(kept) == 250
+    assert (np.diff(held) == 1).all()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from typing import Any
 
 import pytest
@@ -13,7 +14,7 @@ from lightning_pose.data.batches import PoseBatch
 from lightning_pose.errors import ConfigError
 from lightning_pose.geometry import orientation_error_deg, position_error_m
 from lightning_pose.losses import LossConfig
-from lightning_pose.models import ClipModule, PoseModule
+from lightning_pose.models import CNN3D, ClipModule, PoseModule
 from lightning_pose.spec import build
 from tests.models.helpers import ARCHITECTURES, CLIP_LENGTH, features_for, make_model, problem_for, random_poses
 
@@ -57,9 +58,10 @@ def test_every_parameter_gets_a_finite_gradient(architecture: Architecture, monk
     if not model.automatic_optimization:
         pytest.skip("solved in closed form")
     monkeypatch.setattr(model, "log_dict", lambda *args, **kwargs: None)
-    poses = (pose.expand(*frames_of(model, 8)[1:], *pose.shape) for pose in random_poses(8))
-    poses = (pose.movedim(-2, 0) for pose in poses)
-    model.training_step(PoseBatch(features_for(model, 8), *poses, torch.arange(8)), 0).backward()
+    frames = frames_of(model, 8)
+    position_m, quat_wxyz = (pose.unflatten(0, frames) for pose in random_poses(math.prod(frames)))
+    batch = PoseBatch(features_for(model, 8), position_m, quat_wxyz, torch.arange(8))
+    model.training_step(batch, 0).backward()
     for name, parameter in model.named_parameters():
         assert parameter.grad is not None, name
         assert parameter.grad.isfinite().all(), name
@@ -100,7 +102,7 @@ def test_it_learns_what_can_be_learnt(architecture: Architecture) -> None:
     model = make_model(architecture, loss=LossConfig(orientation_weight=5.0))
     problem = problem_for(model)
     trainer = Trainer(
-        max_epochs=100 if isinstance(model, ClipModule) else 25,
+        max_epochs=100 if architecture is CNN3D else 25,  # averages over patches learn slowly
         accelerator="cpu",
         logger=False,
         enable_checkpointing=False,
