@@ -87,3 +87,18 @@ def test_the_table(capsys: pytest.CaptureFixture[str]) -> None:
     assert [cell.strip() for cell in row.split("│")[2:6]] == ["0.200", "2.00", "0.200", "2.00"]
     assert lines.index(row) < next(i for i, line in enumerate(lines) if "oracle" in line)
     assert lines[-1].strip() == "skill position 0.5  parameters 373,000"
+
+
+def test_retrieval_searches_what_the_model_has_learnt_from(workplace: Workplace, scene: Path) -> None:
+    """A model that is solved again with the validation frames is compared with retrieval that may find them."""
+    model = ["--model", "lightning_pose.models.LinearPoseNet", "--model.lambdas", "[1.0]"]
+    pooled = ["--data.extractor", "lightning_pose.features.CNN", "--data.extractor.weights", "none"]
+    oracles = {}
+    for refit in ("true", "false"):
+        assert workplace.run("fit", *model, "--model.refit", refit, *pooled, "--data.extractor.size", "32") == 0
+        oracles[refit] = workplace.runs()[0].data.metrics["baseline/oracle/position_mean_m"]
+    loaded = load_scene(scene)
+    places = {split: np.array([loaded.frames[i].position_m for i in loaded.splits[split]]) for split in loaded.splits}
+    for refit, known in (("false", places["train"]), ("true", np.concatenate([places["train"], places["val"]]))):
+        nearest = np.linalg.norm(places["test"][:, None] - known, axis=2).min(1)
+        assert oracles[refit] == pytest.approx(nearest.mean(), abs=1e-5)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import torch
-from lightning import LightningModule, Trainer
+from lightning import Trainer
 from matplotlib.figure import Figure
 
 from lightning_pose import plots
@@ -14,13 +15,13 @@ from lightning_pose.data.batches import PoseBatch
 from lightning_pose.data.scene import Scene
 from lightning_pose.evaluation.base import Evaluation, costs, skill
 from lightning_pose.geometry import orientation_error_deg, position_error_m
-from lightning_pose.models.base import Pose
+from lightning_pose.models.base import Pose, PoseModule
 
 __all__ = ["evaluate_images"]
 
 
 def evaluate_images(
-    trainer: Trainer, module: LightningModule, outputs: list[Pose], model: Mapping[str, float]
+    trainer: Trainer, module: PoseModule, outputs: list[Pose], model: Mapping[str, float]
 ) -> Evaluation:
     """Judge a test of single images.
 
@@ -32,7 +33,7 @@ def evaluate_images(
     """
     datamodule = trainer.datamodule  # type: ignore[attr-defined]
     scene: Scene = datamodule.scene
-    train, test = (datamodule.dataset(split).data for split in ("train", "test"))
+    train, test = _frames(datamodule, module.learns_from), datamodule.dataset("test").data
     prediction = Pose(*(torch.cat(parts) for parts in zip(*outputs, strict=True)))
     appearance = datamodule.extractor.appearance
     baselines = evaluate_baselines(
@@ -53,6 +54,11 @@ def evaluate_images(
         trajectories={"truth": (frames, Pose(test.position_m, test.quat_wxyz)), "predictions": (frames, prediction)},
         figures=_figures(scene, name, train, test, poses),
     )
+
+
+def _frames(datamodule: Any, splits: tuple[str, ...]) -> PoseBatch:
+    parts = [datamodule.dataset(split).data for split in splits]
+    return PoseBatch(*(torch.cat(tensors) for tensors in zip(*parts, strict=True))) if len(parts) > 1 else parts[0]
 
 
 def _figures(

@@ -16,7 +16,7 @@ from lightning_pose.evaluation.base import Evaluation
 from lightning_pose.evaluation.clips import evaluate_clips
 from lightning_pose.evaluation.images import evaluate_images
 from lightning_pose.evaluation.table import print_results
-from lightning_pose.models.base import Pose
+from lightning_pose.models.base import Pose, PoseModule
 from lightning_pose.models.clip import ClipModule
 from lightning_pose.tracking import MLflowLogger, log_localizer
 from lightning_pose.tum import write_sequences
@@ -59,6 +59,7 @@ class TestReport(Callback):
         if isinstance(pl_module, ClipModule):
             found = evaluate_clips(trainer, pl_module, model, self.visual_odometry)
         else:
+            assert isinstance(pl_module, PoseModule)
             found = evaluate_images(trainer, pl_module, self._poses, model)
         self.results = {type(pl_module).__name__: model, **found.baselines}
         scene = trainer.datamodule.scene  # type: ignore[attr-defined]

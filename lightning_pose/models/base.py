@@ -116,6 +116,11 @@ class PoseModule(LightningModule):
         """The settings that tell one run of this architecture from another, for run names and tables."""
         return "x".join(map(str, self.input_shape))
 
+    @property
+    def learns_from(self) -> tuple[str, ...]:
+        """The splits whose poses end up in the weights; image retrieval may search the same."""
+        return ("train",)
+
     def forward(self, features: Tensor) -> Pose:
         """Features (B, *input_shape) -> poses of B frames."""
         position_m, quat_raw = self._decode(features)

@@ -61,9 +61,8 @@ class KernelPoseNet(LinearPoseNet):
     def setup(self, stage: str) -> None:
         super().setup(stage)
         if stage == "fit":
-            splits = ("train", "val") if self.refit else ("train",)
             datamodule = self.trainer.datamodule  # type: ignore[attr-defined]
-            features = torch.cat([datamodule.dataset(split).data.features for split in splits])
+            features = torch.cat([datamodule.dataset(split).data.features for split in self.learns_from])
             kept = torch.linspace(0, len(features) - 1, min(self.landmarks, len(features))).round().long()
             self.network.remember(self._standardized(features[kept].to(self.device)), self.gamma)
 

@@ -67,6 +67,10 @@ class LinearPoseNet(PoseModule):
     def headline(self) -> str:
         return str(self.input_shape[0]) + (f" K={self.components}" if self.components else "")
 
+    @property
+    def learns_from(self) -> tuple[str, ...]:
+        return ("train", "val") if self.refit else ("train",)
+
     def configure_optimizers(self) -> Any:
         # It has no gradient to step along, but Lightning writes no checkpoint before some optimizer has stepped.
         return torch.optim.SGD(self.parameters())
