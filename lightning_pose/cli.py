@@ -45,6 +45,9 @@ class PoseParser(LightningArgumentParser):
         raise ConfigError(_one_line(message)) from ex
 
 
+SCENES = ("root", "train_scenes")
+"""Settings of the data modules that say what a run trains on."""
+
 REMEDY = "`python -m lightning_pose fit --help` explains every setting"
 NOISE = re.compile(
     r"Does not validate against any of the Union subtypes|Subtypes: .*|Errors:|Expected a <class 'NoneType'>"
@@ -186,7 +189,7 @@ class PoseCLI(LightningCLI):
             experiment_name=logger.init_args.experiment_name,
             checkpoints=Path(config.trainer.default_root_dir) / "checkpoints",
             architecture=config.model.class_path.rpartition(".")[2],
-            root=str(config.data.init_args.root),
+            data={name: config.data.init_args[name] for name in SCENES if name in config.data.init_args},
         )
         logger.init_args.run_id = run_id
         config.ckpt_path = str(checkpoint)

@@ -141,7 +141,9 @@ def flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def last_run(uri: str, experiment_name: str, checkpoints: Path, architecture: str, root: str) -> tuple[str, Path]:
+def last_run(
+    uri: str, experiment_name: str, checkpoints: Path, architecture: str, data: Mapping[str, Any]
+) -> tuple[str, Path]:
     """The newest run of an architecture on a scene that left a `last.ckpt`.
 
     Args:
@@ -149,7 +151,7 @@ def last_run(uri: str, experiment_name: str, checkpoints: Path, architecture: st
         experiment_name: MLflow experiment.
         checkpoints: folder of the runs' checkpoint folders.
         architecture: class name.
-        root: the run's `data.root`, as its parameters have it.
+        data: which scenes it trains on: settings of the data module by name, such as `root`.
 
     Returns:
         The run's id and its last checkpoint.
@@ -161,15 +163,16 @@ def last_run(uri: str, experiment_name: str, checkpoints: Path, architecture: st
 
     client = MlflowClient(uri)
     experiment = client.get_experiment_by_name(experiment_name)
-    query = f"tags.architecture = '{architecture}' and params.`data.root` = '{root}'"
+    scenes = " and ".join(f'params.`data.{name}` = "{value}"' for name, value in data.items())
+    query = f"tags.architecture = '{architecture}' and {scenes}"
     runs = client.search_runs([experiment.experiment_id], query) if experiment else []  # newest first
     for run in runs:
         checkpoint = checkpoints / run.info.run_id / "last.ckpt"
         if checkpoint.is_file():
             return run.info.run_id, checkpoint
+    told = " ".join(f"data.{name}={value}" for name, value in data.items())
     raise CheckpointError(
-        f"no run of {architecture} on data.root={root} left a last.ckpt under {checkpoints}; "
-        "leave --ckpt_path out to start one"
+        f"no run of {architecture} on {told} left a last.ckpt under {checkpoints}; leave --ckpt_path out to start one"
     )
 
 

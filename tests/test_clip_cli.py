@@ -97,3 +97,17 @@ def test_raw_images_show_what_the_layers_respond_to(clip_run: Trained) -> None:
     assert figures == {"trajectory.png", "error_by_length.png", "responses.png"}
     assert "baseline/visual_odometry/position_median_m" not in run.data.metrics
     assert "baseline/no_motion/position_median_m" in run.data.metrics
+
+
+def test_the_last_run_goes_on_only_on_its_own_scenes(
+    clip_run: Trained, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = write_scene(tmp_path / "other", train=(9, 9), test=8)
+    more = ["--ckpt_path", "last", "--trainer.max_epochs", "3", "--report.visual_odometry", "false"]
+    assert clip_run.workplace.run("fit", *more, "--data.train_scenes", f"[{other}]") == 2
+    assert f"no run of CNN3D on data.root=None data.train_scenes=['{other}']" in capsys.readouterr().err
+    assert clip_run.workplace.run("fit", "--report.visual_odometry", "false") == 0  # the newest, whatever ran before
+    runs = len(clip_run.workplace.runs())
+    assert clip_run.workplace.run("fit", *more) == 0
+    assert len(clip_run.workplace.runs()) == runs
+    assert "epoch 3/3" in capsys.readouterr().out

@@ -94,7 +94,7 @@ def test_parameters_of_a_run_that_goes_on_may_differ(logger: MLflowLogger) -> No
 def test_the_last_run_is_the_newest_of_that_architecture_and_scene(trained: Trained) -> None:
     def find(architecture: str, root: str) -> tuple[str, Path]:
         checkpoints = trained.workplace.folder / "mlruns" / "checkpoints"
-        return last_run(trained.workplace.uri, "lightning_pose", checkpoints, architecture, root)
+        return last_run(trained.workplace.uri, "lightning_pose", checkpoints, architecture, {"root": root})
 
     root = str(trained.workplace.scene)
     assert find("SurfLSTM", root) == (trained.run.info.run_id, trained.last)
@@ -106,7 +106,7 @@ def test_the_last_run_is_the_newest_of_that_architecture_and_scene(trained: Trai
 
 def test_no_experiment_has_no_last_run(workplace: Workplace) -> None:
     with pytest.raises(CheckpointError, match="no run of SurfLSTM"):
-        last_run(workplace.uri, "lightning_pose", workplace.folder, "SurfLSTM", "None")
+        last_run(workplace.uri, "lightning_pose", workplace.folder, "SurfLSTM", {"root": None})
 
 
 def test_a_logged_model_names_all_that_it_imports() -> None:
