@@ -110,4 +110,4 @@ def test_the_last_run_goes_on_only_on_its_own_scenes(
     runs = len(clip_run.workplace.runs())
     assert clip_run.workplace.run("fit", *more) == 0
     assert len(clip_run.workplace.runs()) == runs
-    assert "epoch 3/3" in capsys.readouterr().out
+    assert "epoch 3/3" in capsys.readouterr().err
