@@ -116,7 +116,8 @@ def _judge_length(
     datamodule: Any, module: ClipModule, sequences: list[Sequence], length: int
 ) -> dict[str, dict[str, float]]:
     """Metrics of the model, first, and of every baseline on clips of one length, first frames left out."""
-    clips: ClipDataset = datamodule.clips("test", length)
+    own = length == datamodule.clip_length  # with its own hop, as the model's metrics are
+    clips: ClipDataset = datamodule.dataset("test") if own else datamodule.clips("test", length)
     truth = Pose(*(part.double() for part in clips.targets()))
     count = len(clips)
     position_m, quat_wxyz = datamodule.dataset("train").targets()
@@ -186,7 +187,7 @@ def _figures(
     datamodule: Any, name: str, sequences: list[Sequence], found: Mapping[int, Mapping[str, Mapping[str, float]]]
 ) -> dict[str, Figure]:
     scene = datamodule.scene
-    shown = {_title(s, i): s for i, s in enumerate(sequences)}
+    shown = _titled(sequences)
     lengths = list(found)
     errors = {
         system: ([found[n][system][_BY_LENGTH[0]] for n in lengths], [found[n][system][_BY_LENGTH[1]] for n in lengths])
@@ -205,9 +206,13 @@ def _figures(
     }
 
 
-def _title(sequence: Sequence, number: int) -> str:
-    """A sequence's name, with the number of the run: a sequence with gaps has several."""
-    return f"{sequence.frames[0].sequence} #{number + 1}"
+def _titled(sequences: list[Sequence]) -> dict[str, Sequence]:
+    """Sequences by name, with a number where a sequence has gaps, and so several runs."""
+    names = [sequence.frames[0].sequence for sequence in sequences]
+    numbered = (
+        f"{name} #{names[:i].count(name) + 1}" if names.count(name) > 1 else name for i, name in enumerate(names)
+    )
+    return dict(zip(numbered, sequences, strict=True))
 
 
 def _responses(datamodule: Any, module: LightningModule) -> Figure:
