@@ -69,6 +69,7 @@ HELP = {
 
   the built-in room      fit --config configs/quickstart.yaml
   your data              fit --config configs/surf_lstm.yaml --data.root DIR
+  video, unseen scenes   fit --config configs/cnn_rnn.yaml --data.train_scenes "[DIR]" --data.test_scenes "[DIR]"
   change any setting     ... --model.units 200 --data.extractor.n_features 100 --trainer.max_epochs 20
   another seed           ... --seed_everything 1
   go on after a stop     ... --ckpt_path last
@@ -168,6 +169,7 @@ class PoseCLI(LightningCLI):
             if str(error).startswith("Does not validate"):
                 raise ConfigError(_one_line(str(error))) from error
             raise
+        self.model.check_data(self.datamodule)
 
     def before_instantiate_classes(self) -> None:
         if self.subcommand in ("validate", "predict"):

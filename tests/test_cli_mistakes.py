@@ -185,6 +185,15 @@ def test_a_finished_run_cannot_go_on(complaint: Complaint, workplace: Workplace,
     assert f"{trained.last} has 2 epochs behind it and trainer.max_epochs is 2; raise --trainer.max_epochs" in line
 
 
+def test_an_architecture_for_other_data(complaint: Complaint, workplace: Workplace) -> None:
+    line = complaint("fit", "--config", workplace.config, "--model", "lightning_pose.models.CNN3D")
+    assert "CNN3D reads clips, but ImageDataModule gives images; set data.class_path to" in line
+    assert line.endswith("lightning_pose.data.datamodules.ClipDataModule")
+    clips = ["--config", REPOSITORY / "configs" / "cnn_rnn.yaml", "--data.root", workplace.scene]
+    line = complaint("fit", *clips, "--data.relative_frame", "world")
+    assert "integrate composes camera motions, but data.relative_frame is world; set camera" in line
+
+
 def test_no_last_run(complaint: Complaint, workplace: Workplace) -> None:
     line = complaint("fit", "--config", workplace.config, "--ckpt_path", "last")
     assert re.search(rf"no run of SurfLSTM on data.root={workplace.scene} .*; leave --ckpt_path out", line)

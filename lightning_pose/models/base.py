@@ -63,6 +63,7 @@ class PoseModule(LightningModule):
     input_ranks: ClassVar[tuple[int, ...]]
     feature_axis: ClassVar[int] = -1
     memory: ClassVar[tuple[str, ...]] = ()
+    reads_clips: ClassVar[bool] = False
     network: nn.Module
     pose_mean: Tensor
     pose_scale: Tensor
@@ -171,7 +172,21 @@ class PoseModule(LightningModule):
             self.feature_mean.copy_(rows.mean(0).view_as(self.feature_mean))
             self.feature_scale.copy_(rows.std(0).clamp(min=1e-6).view_as(self.feature_scale))
 
+    def check_data(self, datamodule: Any) -> None:
+        """Refuse data that this architecture cannot read; the command line asks before it opens a run.
+
+        Raises:
+            ConfigError: it gives clips where images are read, or the other way round.
+        """
+        if self.reads_clips != getattr(datamodule, "gives_clips", False):
+            wanted, given = ("clips", "images") if self.reads_clips else ("images", "clips")
+            raise ConfigError(
+                f"{type(self).__name__} reads {wanted}, but {type(datamodule).__name__} gives {given}; set "
+                f"data.class_path to lightning_pose.data.datamodules.{wanted.title()[:-1]}DataModule"
+            )
+
     def setup(self, stage: str) -> None:
+        self.check_data(self.trainer.datamodule)  # type: ignore[attr-defined]
         if stage == "fit":
             train = self.trainer.datamodule.dataset("train")  # type: ignore[attr-defined]
             self.fit_scale(*(part.to(self.device) for part in self._training_poses(train)))

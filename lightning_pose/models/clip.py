@@ -38,6 +38,7 @@ class ClipModule(PoseModule):
     """
 
     input_ranks: ClassVar[tuple[int, ...]] = (2, 3)
+    reads_clips: ClassVar[bool] = True
 
     motion_scale: Tensor
 
@@ -70,18 +71,18 @@ class ClipModule(PoseModule):
         shape = "x".join(map(str, self.input_shape))
         return shape + " motion" * self.motion + " integrated" * self.integrate
 
-    def setup(self, stage: str) -> None:
-        super().setup(stage)
-        if stage != "fit":
-            return
-        datamodule = self.trainer.datamodule  # type: ignore[attr-defined]
-        if self.motion:
-            self._fit_motion_scale(datamodule.dataset("train"))
+    def check_data(self, datamodule: Any) -> None:
+        super().check_data(datamodule)
         frame = datamodule.relative_frame
         if self.integrate and frame != "camera":
             raise ConfigError(
                 f"model.integrate composes camera motions, but data.relative_frame is {frame}; set camera"
             )
+
+    def setup(self, stage: str) -> None:
+        super().setup(stage)
+        if stage == "fit" and self.motion:
+            self._fit_motion_scale(self.trainer.datamodule.dataset("train"))  # type: ignore[attr-defined]
 
     def _fit_motion_scale(self, train: Any) -> None:
         """Learn how far features move, from some training clips."""

@@ -108,6 +108,7 @@ class LearnableProblem(LightningDataModule):
 class ClipProblem(LearnableProblem):
     """Clips in which every frame shows where it is."""
 
+    gives_clips = True
     relative_frame = "camera"
 
     def __init__(self, input_shape: list[int], count: int = 24) -> None:

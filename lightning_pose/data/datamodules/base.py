@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -30,7 +30,7 @@ def room_folder(seed: int, frames: int) -> Path:
 
 
 class SceneDataModule(LightningDataModule):
-    """Scene -> cached features -> batches.
+    """Scene -> cached features -> batches; of clips where `gives_clips` says so.
 
     A child gives `_load_scene`, `train_dataloader`, and `_make_dataset` where a split is more than its frames. It
     keeps every constructor argument as an attribute of the same name.
@@ -46,6 +46,8 @@ class SceneDataModule(LightningDataModule):
         ConfigError: a number is out of its range.
         DataError: the scene cannot be read, or a split that is needed is empty.
     """
+
+    gives_clips: ClassVar[bool] = False
 
     def __init__(
         self,

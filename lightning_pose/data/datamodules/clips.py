@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from torch.utils.data import DataLoader
 
@@ -60,6 +60,8 @@ class ClipDataModule(SceneDataModule):
         ConfigError: a number is out of its range, or scenes are named in two ways.
         DataError: a scene cannot be read, or no run of consecutive frames is as long as a clip.
     """
+
+    gives_clips: ClassVar[bool] = True
 
     def __init__(
         self,
