@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lightning_pose.geometry import orientation_error_deg, quat_normalize
 from lightning_pose.models.base import Pose
-from lightning_pose.relative import RelativeFrame, relative_poses
+from lightning_pose.relative import Chain, RelativeFrame, relative_poses
 from lightning_pose.sequences import locate_sequence, windows
 
 
@@ -61,3 +61,14 @@ def test_without_a_start_it_begins_at_the_origin() -> None:
     expected = relative_poses(position_m, quat_wxyz)
     torch.testing.assert_close(found[0], expected[0])
     torch.testing.assert_close(found[1][0], torch.eye(4)[0].double())
+
+
+def test_a_live_camera_is_followed_frame_by_frame() -> None:
+    """A clip of the last four frames each time: every frame is placed as soon as it comes."""
+    position_m, quat_wxyz = walk(9)
+    model, chain = cast("Any", Knowing("camera")), Chain("camera", position_m[0], quat_wxyz[0])
+    for now in range(1, 9):
+        numbers = list(range(max(0, now - 3), now + 1))
+        pose = model(torch.cat([position_m, quat_wxyz], 1)[numbers][None])
+        assert chain.add(numbers, pose.position_m[0], pose.quat_wxyz[0])[-1] == now
+    torch.testing.assert_close(chain.trajectory()[1], position_m)
