@@ -135,7 +135,7 @@ def test_a_killed_process(workplace: Workplace) -> None:
                 assert time.monotonic() < deadline, "no checkpoint yet"
                 time.sleep(0.1)
             process.send_signal(number)
-            _, stderr = process.communicate(timeout=60)
+            _, stderr = process.communicate(timeout=200)
         finally:
             process.kill()
         outcome[number] = (process.returncode, stderr, [run.info.status for run in workplace.runs()])
