@@ -16,6 +16,7 @@ VERBS = {
     "test": ("lightning_pose.cli", "measure a checkpoint on the test frames, beside its baselines"),
     "predict": ("lightning_pose.cli", "write a checkpoint's poses of the test frames as TUM files"),
     "extract": ("lightning_pose.extract", "fill the feature cache: parallel, resumable"),
+    "sweep": ("lightning_pose.sweep", "search a config's settings, on validation frames: parallel, resumable"),
     "check": ("lightning_pose.check", "say what a dataset holds, and what is wrong with it"),
     "synth": ("lightning_pose.synth", "render a synthetic room as a dataset"),
 }

@@ -1,0 +1,59 @@
+"""The study's own MLflow run, which holds those of its trials."""
+
+from __future__ import annotations
+
+from mlflow import MlflowClient
+from mlflow.exceptions import MlflowException
+from optuna import Study
+
+from lightning_pose.sweeps.plan import Plan
+from lightning_pose.sweeps.trial import RUN
+from lightning_pose.tracking import MLflowLogger
+
+__all__ = ["close_run", "open_parent"]
+
+
+def open_parent(study: Study, plan: Plan) -> tuple[MlflowClient, str]:
+    """The MLflow run that holds the trials: the study's own, reopened, or a new one.
+
+    Returns:
+        A client, and the run's id.
+    """
+    uri, experiment = plan.tracking
+    logger = plan.resolved["trainer"]["logger"]["init_args"]
+    kept = study.user_attrs.get(RUN)
+    if kept is not None and not _exists(MlflowClient(uri), kept):
+        kept = None  # another MLflow store than last time
+    record = MLflowLogger(experiment, run_name=study.study_name, tracking_uri=uri, run_id=kept, root=logger["root"])
+    client, run = record.client, str(record.run_id)
+    client.update_run(run, status="RUNNING")
+    if kept is None:
+        study.set_user_attr(RUN, run)
+        tags = {
+            "verb": "sweep",
+            "architecture": plan.resolved["model"]["class_path"].rpartition(".")[2],
+            "scene": plan.scene,
+            "sweep.study": study.study_name,
+            "sweep.sampler": plan.sampler["name"],
+            "sweep.objectives": ", ".join(objective.metric for objective in plan.objectives),
+        }
+        for name, value in tags.items():
+            client.set_tag(run, name, value)
+        client.log_artifact(run, str(plan.file))
+        client.log_artifact(run, str(plan.base))
+    return client, run
+
+
+def close_run(client: MlflowClient, run: str | None) -> None:
+    """Mark the run of a trial whose process died; None where it had none yet."""
+    if run is not None and _exists(client, run):
+        client.set_tag(run, "sweep.state", "FAILED")
+        client.set_tag(run, "sweep.reason", "its process died")
+        client.set_terminated(run, "KILLED")
+
+
+def _exists(client: MlflowClient, run: str) -> bool:
+    try:
+        return client.get_run(run).info.lifecycle_stage == "active"
+    except MlflowException:
+        return False

@@ -1,0 +1,176 @@
+"""One trial: a run of `fit` that reports every epoch, can be cut short, and never sees the test frames."""
+
+from __future__ import annotations
+
+import math
+import os
+import socket
+import traceback
+from typing import Any
+
+import optuna
+from lightning import LightningModule, Trainer
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint
+from mlflow import MlflowClient
+from optuna import Trial
+
+from lightning_pose.callbacks import train_seconds
+from lightning_pose.cli import PoseCLI
+from lightning_pose.errors import ConfigError, PoseError
+from lightning_pose.sweeps.plan import Plan
+from lightning_pose.sweeps.space import draw
+from lightning_pose.tracking import HOST_TAG, PROCESS_TAG
+
+__all__ = ["PROCESS", "REASON", "RUN", "process_name", "process_tags", "run_trial"]
+
+PROCESS, REASON, RUN = "process", "reason", "mlflow_run"
+"""What Optuna keeps of a trial beside its values: who runs it, why it ended early, and its MLflow run."""
+
+
+def process_name() -> str:
+    """This process, on whatever machine."""
+    return f"{socket.gethostname()}:{os.getpid()}"
+
+
+def process_tags() -> dict[str, str]:
+    """By which a later run finds out that this process has died."""
+    return {HOST_TAG: socket.gethostname(), PROCESS_TAG: str(os.getpid())}
+
+
+class EpochWatch(Callback):
+    """Keeps the validation metrics of each epoch, and asks the pruner whether to go on.
+
+    Args:
+        plan: of the sweep.
+        trial: what reports go to.
+    """
+
+    def __init__(self, plan: Plan, trial: Trial) -> None:
+        self.objectives = plan.objectives
+        self.trial = trial
+        self.epochs: list[dict[str, float]] = []
+        self.pruned: str | None = None
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if trainer.sanity_checking:
+            return
+        measured = {name: float(v) for name, v in trainer.callback_metrics.items() if name.startswith("val/")}
+        self.epochs.append(measured)
+        first = self.objectives[0].metric
+        # Pruners compare trials by one number; Optuna refuses reports for several objectives.
+        if len(self.objectives) > 1 or not math.isfinite(measured.get(first, math.nan)):
+            return
+        self.trial.report(measured[first], trainer.current_epoch)
+        last = trainer.current_epoch + 1 == trainer.max_epochs  # nothing is saved by giving that one up
+        if not last and self.trial.should_prune():
+            self.pruned = f"pruned after epoch {trainer.current_epoch + 1} with {first} {measured[first]:.4g}"
+            trainer.should_stop = True
+
+    def values(self) -> dict[str, float]:
+        """The metrics of the best epoch by the first objective that is measured; all of one epoch, so that
+        no mixture is reported that no weights ever had.
+
+        Raises:
+            ConfigError: no validation frames, or no epoch ended in a number.
+        """
+        chosen = next((o for o in self.objectives if o.metric.startswith("val/")), None)
+        if chosen is None:
+            return {}
+        if not self.epochs:
+            raise ConfigError(f"{chosen.metric} was never measured; give data.val_fraction, such as 0.1")
+        finite = [epoch for epoch in self.epochs if math.isfinite(epoch[chosen.metric])]
+        if not finite:
+            raise ConfigError(f"{chosen.metric} was never a finite number: training diverged; lower the learning rate")
+        return sorted(finite, key=lambda epoch: epoch[chosen.metric], reverse=chosen.maximize)[0]
+
+
+class _TrialCLI(PoseCLI):
+    """`fit` without the test that follows it, without checkpoints, which nothing reads, and without its own bar."""
+
+    def __init__(self, args: list[str], watch: EpochWatch) -> None:
+        self.watch = watch
+        super().__init__(["fit", *args])
+
+    def instantiate_trainer(self, **kwargs: Any) -> Trainer:
+        trainer = super().instantiate_trainer(**kwargs)
+        kept = [c for c in trainer.callbacks if not isinstance(c, ModelCheckpoint)]  # type: ignore[attr-defined]
+        trainer.callbacks = [*kept, self.watch]  # type: ignore[attr-defined]
+        if trainer.progress_bar_callback is not None:
+            trainer.progress_bar_callback.disable()
+        return trainer
+
+    def after_fit(self) -> None:
+        """Nothing: test frames must not choose."""
+
+    def costs(self) -> dict[str, float]:
+        """What the model costs, as far as it is known without test frames."""
+        parameters = sum(p.numel() for p in self.model.network.parameters())
+        return {"cost/parameters": float(parameters), "cost/train_seconds": train_seconds(self.trainer) or 0.0}
+
+
+def run_trial(trial: Trial, plan: Plan, parent: str) -> float | list[float]:
+    """Train once with the trial's values, as a nested MLflow run.
+
+    Args:
+        trial: asks for values, takes reports.
+        plan: of the sweep.
+        parent: MLflow run id of the study.
+
+    Returns:
+        The objectives' values.
+
+    Raises:
+        optuna.TrialPruned: the pruner stopped it.
+        KeyboardInterrupt: the user did.
+        Exception: whatever broke it; Optuna and MLflow know why.
+    """
+    trial.set_user_attr(PROCESS, process_name())
+    uri, experiment = plan.tracking
+    client = MlflowClient(uri)
+    tags = {"mlflow.parentRunId": parent, "sweep.study": trial.study.study_name, "sweep.trial": str(trial.number)}
+    name = f"trial {trial.number}"
+    known = client.get_experiment_by_name(experiment)
+    assert known is not None, "the study's run is in it"
+    run = client.create_run(known.experiment_id, run_name=name, tags=tags | process_tags()).info.run_id
+    trial.set_user_attr(RUN, run)
+    try:
+        values = draw(trial, plan.space)
+        for key, value in values.items():
+            client.set_tag(run, f"sweep.{key}", str(value))
+        logger = [f"--trainer.logger.run_id={run}", f"--trainer.logger.run_name={name}"]
+        return _fit(trial, plan, [*plan.arguments(values), *logger], client, run)
+    except optuna.TrialPruned as pruned:
+        _end(trial, client, run, "PRUNED", "KILLED", str(pruned))
+        raise
+    except (KeyboardInterrupt, SystemExit) as stop:  # Lightning turns Ctrl-C and SIGTERM into SystemExit
+        _end(trial, client, run, "INTERRUPTED", "KILLED", "interrupted")
+        raise KeyboardInterrupt from stop
+    except Exception as error:
+        reason = str(error) if isinstance(error, PoseError) else f"{type(error).__name__}: {error}"
+        _end(trial, client, run, "FAILED", "FAILED", reason)
+        client.log_text(run, traceback.format_exc(), "error.txt")
+        raise
+
+
+def _fit(trial: Trial, plan: Plan, args: list[str], client: MlflowClient, run: str) -> float | list[float]:
+    watch = EpochWatch(plan, trial)
+    cli = _TrialCLI(args, watch)
+    if watch.pruned is not None:
+        raise optuna.TrialPruned(watch.pruned)
+    found = watch.values() | cli.costs()
+    for name, value in cli.costs().items():
+        client.log_metric(run, name, value)
+    values = [found[objective.metric] for objective in plan.objectives]
+    for objective, value in zip(plan.objectives, values, strict=True):
+        client.log_metric(run, f"objective/{objective.metric}", value)
+    client.set_tag(run, "sweep.state", "COMPLETE")
+    return values if len(values) > 1 else values[0]
+
+
+def _end(trial: Trial, client: MlflowClient, run: str, state: str, status: str, reason: str) -> None:
+    """Write down why a trial has no value, where Optuna and where MLflow look."""
+    shown = " ".join(reason.split())[:500]
+    trial.set_user_attr(REASON, shown)
+    client.set_tag(run, "sweep.state", state)
+    client.set_tag(run, "sweep.reason", shown)
+    client.set_terminated(run, status)
