@@ -209,13 +209,19 @@ class PoseCLI(LightningCLI):
 
     def predict(self, model: PoseModule, datamodule: Any, **kwargs: Any) -> None:
         """Write one TUM file a sequence of the test split."""
-        batches: list[Any] = self.trainer.predict(model, datamodule=datamodule, **kwargs) or []
         scene = datamodule.scene
         if isinstance(model, ClipModule):
-            frames, position_m, quat_wxyz = chain_test(model, datamodule)
+            datamodule.prepare_data()
+            model.load_state_dict(read_checkpoint(kwargs["ckpt_path"])["state_dict"])
+            rows, *poses = (torch.cat(parts) for parts in zip(*chain_test(model, datamodule), strict=True))
+            numbers = datamodule.dataset("test").data.frame[rows].tolist()
         else:
-            frames = [scene.frames[i] for i in scene.splits["test"]]
-            position_m, quat_wxyz = (torch.cat(parts).numpy() for parts in zip(*batches, strict=True))
+            poses = map(
+                torch.cat, zip(*self.trainer.predict(model, datamodule=datamodule, **kwargs) or [], strict=True)
+            )
+            numbers = scene.splits["test"]
+        position_m, quat_wxyz = (part.numpy() for part in poses)
+        frames = [scene.frames[i] for i in numbers]
         folder = Path(self.trainer.default_root_dir) / "predictions" / f"{type(model).__name__}-{scene.name}"
         for file in write_sequences(folder, frames, position_m, quat_wxyz):
             print(file)

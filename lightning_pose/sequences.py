@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from lightning_pose.data.scene import Frame
 from lightning_pose.relative import Chain, RelativeFrame
 
 if TYPE_CHECKING:
     from lightning_pose.data.datamodules import ClipDataModule
     from lightning_pose.models.clip import ClipModule
 
-__all__ = ["chain_test", "locate_sequence", "windows"]
+__all__ = ["Chained", "chain_test", "locate_sequence", "windows"]
 
 
 def windows(frames: int, length: int) -> list[range]:
@@ -53,18 +51,27 @@ def locate_sequence(
     return position_m, quat_wxyz
 
 
-def chain_test(model: ClipModule, datamodule: ClipDataModule) -> tuple[list[Frame], np.ndarray, np.ndarray]:
-    """Trajectories of the test split's sequences, each from the true pose of its first frame.
+class Chained(NamedTuple):
+    """A run of test frames, M of them, and where a model says they are.
 
-    Returns:
-        M frames, position_m (M, 3) and quat_wxyz (M, 4), float64.
+    Attributes:
+        rows: (M,) rows of the test split's data.
+        position_m: (M, 3) float64, from the true position of the first frame.
+        quat_wxyz: (M, 4) float64, from its true orientation.
     """
-    test, model = datamodule.dataset("test"), model.eval()
-    rows, parts = [], []
-    for run in (torch.from_numpy(run[:: datamodule.stride]) for run in test.runs):
-        first = test.data.position_m[run[0]], test.data.quat_wxyz[run[0]]
-        features, length = test.data.features[run], datamodule.clip_length
-        parts.append(locate_sequence(model, features, length, datamodule.relative_frame, *first))
-        rows.append(run)
-    position_m, quat_wxyz = (torch.cat(part).numpy() for part in zip(*parts, strict=True))
-    return [datamodule.scene.frames[i] for i in test.data.frame[torch.cat(rows)].tolist()], position_m, quat_wxyz
+
+    rows: Tensor
+    position_m: Tensor
+    quat_wxyz: Tensor
+
+
+def chain_test(model: ClipModule, datamodule: ClipDataModule) -> list[Chained]:
+    """Trajectories of the test split's runs of two frames or more, each from the true pose of its first frame."""
+    data, model = datamodule.dataset("test").data, model.eval()
+    found = []
+    for rows in (torch.from_numpy(run[:: datamodule.stride]) for run in datamodule.dataset("test").runs):
+        if len(rows) > 1:
+            first = data.position_m[rows[0]], data.quat_wxyz[rows[0]]
+            clips = datamodule.clip_length, datamodule.relative_frame
+            found.append(Chained(rows, *locate_sequence(model, data.features[rows], *clips, *first)))
+    return found

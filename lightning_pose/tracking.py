@@ -19,7 +19,7 @@ from lightning_pose.errors import CheckpointError
 if TYPE_CHECKING:
     from mlflow import MlflowClient
 
-__all__ = ["MLflowLogger", "default_tracking_uri", "flatten", "last_run", "log_localizer"]
+__all__ = ["MLflowLogger", "alive", "default_tracking_uri", "flatten", "last_run", "log_localizer"]
 
 REQUIREMENTS = (
     "torch",
@@ -102,7 +102,7 @@ class MLflowLogger(MLFlowLogger):
         """Mark runs of this machine whose process is gone: nothing could mark them when they died."""
         query = f"attributes.status = 'RUNNING' and tags.`{HOST_TAG}` = '{socket.gethostname()}'"
         for run in client.search_runs([str(self.experiment_id)], query):
-            if run.info.run_id != self.run_id and not _alive(int(run.data.tags[PROCESS_TAG])):
+            if run.info.run_id != self.run_id and not alive(int(run.data.tags[PROCESS_TAG])):
                 client.set_terminated(run.info.run_id, "KILLED")
 
     @rank_zero_only
@@ -119,7 +119,8 @@ class MLflowLogger(MLFlowLogger):
             self.client.set_terminated(str(self.run_id), self.stopped_as if status == "failed" else "FINISHED")
 
 
-def _alive(process: int) -> bool:
+def alive(process: int) -> bool:
+    """Whether a process of this machine runs."""
     try:
         os.kill(process, 0)
     except ProcessLookupError:
@@ -181,7 +182,8 @@ def log_localizer(logger: MLflowLogger, checkpoint: Path) -> None:
     import mlflow
 
     os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
-    for noisy in ("mlflow.utils.environment", "mlflow.models.signature"):  # uv has no pip; a table is no type hint
+    # uv has no pip; a table is no type hint; and it tells of a lock file that it copies.
+    for noisy in ("mlflow.utils.environment", "mlflow.models.signature", "mlflow.utils.uv_utils"):
         logging.getLogger(noisy).setLevel(logging.ERROR)
     mlflow.set_tracking_uri(logger.uri)
     with mlflow.start_run(run_id=str(logger.run_id)), warnings.catch_warnings():

@@ -19,7 +19,7 @@ from lightning_pose.geometry import orientation_error_deg, position_error_m, qua
 from lightning_pose.models.base import Pose
 from lightning_pose.models.clip import ClipModule, layer_responses
 from lightning_pose.relative import absolute_poses, relative_poses
-from lightning_pose.sequences import locate_sequence
+from lightning_pose.sequences import chain_test
 from lightning_pose.summary import summarize_errors
 from lightning_pose.trajectories import drift_by_length, mean_over_sequences, trajectory_errors
 from lightning_pose.visual_odometry import visual_odometry
@@ -92,21 +92,16 @@ def _prefix(system: str, model: str) -> str:
 
 def _locate(datamodule: Any, module: ClipModule, odometry: bool) -> list[Sequence]:
     """Chain clips over every run of test frames that holds two."""
-    test: ClipDataset = datamodule.dataset("test")
-    scene, data = datamodule.scene, test.data
-    runs = [torch.from_numpy(run[:: datamodule.stride]) for run in test.runs]
+    scene, data = datamodule.scene, datamodule.dataset("test").data
     found = []
-    for rows in (rows for rows in runs if len(rows) > 1):
+    for rows, *chained in chain_test(module, datamodule):
         frames = [scene.frames[i] for i in data.frame[rows].tolist()]
         truth = Pose(data.position_m[rows].double(), data.quat_wxyz[rows].double())
-        start = truth.position_m[0], truth.quat_wxyz[0]
-        chained = locate_sequence(
-            module, data.features[rows], datamodule.clip_length, datamodule.relative_frame, *start
-        )
         systems, failed = {type(module).__name__: Pose(*chained)}, 0
         if odometry:
             motion = visual_odometry(frames, torch.arange(len(frames))[None])
             failed = motion.failed_steps
+            start = truth.position_m[0], truth.quat_wxyz[0]
             systems["visual_odometry"] = Pose(*absolute_poses(motion.position_m[0], motion.quat_wxyz[0], *start))
         found.append(Sequence(rows, frames, truth, systems, failed))
     return found

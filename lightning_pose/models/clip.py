@@ -7,7 +7,6 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from lightning_pose.data.batches import PoseBatch
 from lightning_pose.errors import ConfigError
 from lightning_pose.geometry import quat_normalize, relative_pose
 from lightning_pose.models.base import Pose, PoseModule
@@ -114,10 +113,6 @@ class ClipModule(PoseModule):
 
     def _judged(self, pose: Pose) -> Pose:
         return Pose(pose.position_m[:, 1:], pose.quat_wxyz[:, 1:])
-
-    def predict_step(self, batch: PoseBatch, batch_idx: int) -> tuple[Tensor, Tensor, Tensor]:  # type: ignore[override]
-        """Frames (B, T) and their poses, for chaining."""
-        return batch.frame, *self(batch.features)
 
 
 @torch.no_grad()

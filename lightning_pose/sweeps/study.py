@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import socket
 import time
 import warnings
@@ -27,6 +26,7 @@ from lightning_pose.sweeps.plan import Plan
 from lightning_pose.sweeps.record import close_run
 from lightning_pose.sweeps.space import grid, nearest
 from lightning_pose.sweeps.trial import PROCESS, REASON, RUN
+from lightning_pose.tracking import alive
 
 __all__ = [
     "attach",
@@ -241,7 +241,7 @@ def recover(study: Study, storage: RDBStorage, client: MlflowClient) -> int:
     queued = 0
     for trial in study.get_trials(states=(TrialState.RUNNING,)):
         host, _, process = trial.user_attrs.get(PROCESS, "").rpartition(":")
-        if host != socket.gethostname() or _alive(int(process)):
+        if host != socket.gethostname() or alive(int(process)):
             continue
         try:
             storage.set_trial_user_attr(trial._trial_id, REASON, "its process died")
@@ -251,13 +251,3 @@ def recover(study: Study, storage: RDBStorage, client: MlflowClient) -> int:
         close_run(client, trial.user_attrs.get(RUN))
         queued += queue_again(study, trial.number)
     return queued
-
-
-def _alive(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        pass
-    return True
