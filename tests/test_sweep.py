@@ -76,11 +76,11 @@ def test_a_class_can_be_searched_with_its_own_settings(sweep_file: Sweep) -> Non
         "data.extractor.class_path": [orb, surf],
         "data.extractor.fast_threshold": {"choices": [5], "when": {"data.extractor.class_path": orb}},
     }
-    plan = read_plan(sweep_file(space=space), {"model": "lightning_pose.models.SurfCNN"})
+    plan = read_plan(sweep_file(space=space), {"model": "lightning_pose.models.GraphPose"})
     config = plan.config({"data.extractor.class_path": orb, "data.extractor.fast_threshold": 5})
     assert config["data"]["init_args"]["extractor"] == {"class_path": orb, "init_args": {"fast_threshold": 5}}
-    assert config["model"]["class_path"] == "lightning_pose.models.SurfCNN"
-    assert config["model"]["init_args"] == {"units": 8, "learning_rate": 0.01, "schedule": "constant"}, "no layers"
+    assert config["model"]["class_path"] == "lightning_pose.models.GraphPose"
+    assert config["model"]["init_args"] == {"learning_rate": 0.01, "schedule": "constant"}, "no units, no layers"
 
 
 def test_a_password_is_not_shown() -> None:

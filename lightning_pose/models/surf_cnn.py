@@ -23,12 +23,14 @@ class SurfCNN(PoseModule):
     Args:
         channels: filters of each convolution.
         kernels: side of each convolution's kernel; the first has stride 2.
+        layers: how many convolutions, the last of the two lists repeated beyond their end (fig. 2.4); as many as they
+            have, if not given.
         units: width of the fully connected layer.
         dropout: before the last linear layer.
         **kwargs: what `PoseModule` takes.
 
     Raises:
-        ConfigError: `channels` and `kernels` differ in length, or a kernel is even.
+        ConfigError: `channels` and `kernels` differ in length, a kernel is even, or `layers` is not positive.
     """
 
     input_ranks: ClassVar[tuple[int, ...]] = (2,)
@@ -37,6 +39,7 @@ class SurfCNN(PoseModule):
         self,
         channels: list[int] = [64, 128, 256, 256, 256],  # noqa: B006  (never changed; shown as it is in --help)
         kernels: list[int] = [7, 5, 5, 5, 3],  # noqa: B006
+        layers: int | None = None,
         units: int = 2048,
         dropout: float = 0.5,
         **kwargs: Any,
@@ -46,6 +49,10 @@ class SurfCNN(PoseModule):
             raise ConfigError(
                 f"channels {channels} and kernels {kernels} do not fit: give as many of each, kernels odd"
             )
+        if layers is not None and layers < 1:
+            raise ConfigError(f"layers is {layers}; give 1 or more")
+        depth = len(channels) if layers is None else layers
+        channels, kernels = (sizes[:depth] + sizes[-1:] * (depth - len(sizes)) for sizes in (channels, kernels))
         self.network = _ConvRegressor(self.input_shape, channels, kernels, units, dropout)
 
     @property

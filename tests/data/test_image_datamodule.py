@@ -61,7 +61,7 @@ def test_loaders(scene: Path) -> None:
 
 
 def test_a_feature_pool_is_drawn_from_in_training_only(scene: Path) -> None:
-    data = ImageDataModule(ORB(n_features=10), root=str(scene), feature_pool=40)
+    data = ImageDataModule(ORB(n_features=10), root=str(scene), feature_pool=4.0)
     strongest = ImageDataModule(ORB(n_features=40), root=str(scene)).dataset("train").data
     for batch in data.train_dataloader():
         assert batch.features.shape[1:] == data.input_shape == (10, 256)
@@ -71,15 +71,22 @@ def test_a_feature_pool_is_drawn_from_in_training_only(scene: Path) -> None:
     torch.testing.assert_close(data.dataset("train").data.features, strongest.features[:, :10])
 
 
-@pytest.mark.parametrize("pool", [9, 301])
-def test_a_feature_pool_out_of_range_is_refused(pool: int, scene: Path) -> None:
-    with pytest.raises(ConfigError, match=rf"data.feature_pool is {pool}; give 10 \(n_features\) to 300"):
-        ImageDataModule(ORB(n_features=10), root=str(scene), feature_pool=pool)
+@pytest.mark.parametrize(("times", "rows"), [(1.0, 10), (1.5, 15), (100, 300)])
+def test_a_feature_pool_grows_with_the_features_up_to_what_is_stored(times: float, rows: int, scene: Path) -> None:
+    data = ImageDataModule(ORB(n_features=10), root=str(scene), feature_pool=times)
+    assert data._pool is not None
+    assert data._pool.n_features == rows
+
+
+@pytest.mark.parametrize("times", [0.9, float("nan")])
+def test_a_feature_pool_smaller_than_what_is_read_is_refused(times: float, scene: Path) -> None:
+    with pytest.raises(ConfigError, match=rf"data.feature_pool is {times}; give how many times n_features it holds"):
+        ImageDataModule(ORB(n_features=10), root=str(scene), feature_pool=times)
 
 
 def test_a_feature_pool_needs_local_features(scene: Path) -> None:
     with pytest.raises(ConfigError, match=r"data.feature_pool needs local features, and thumbnails has none; leave"):
-        module(scene, feature_pool=40)
+        module(scene, feature_pool=4.0)
 
 
 def test_no_validation_frames_is_no_loader(scene: Path) -> None:

@@ -30,5 +30,19 @@ def test_settings_that_do_not_fit_are_refused(channels: list[int], kernels: list
         SurfCNN(input_shape=[20, 64], channels=channels, kernels=kernels)
 
 
+@pytest.mark.parametrize(("layers", "widths"), [(1, [4]), (3, [4, 6, 8]), (5, [4, 6, 8, 8, 8]), (None, [4, 6, 8])])
+def test_layers_cut_the_lists_or_repeat_their_last(layers: int | None, widths: list[int]) -> None:
+    model = SurfCNN(input_shape=[20, 64], channels=[4, 6, 8], kernels=[7, 5, 3], layers=layers, units=8).eval()
+    convolutions = [module for module in model.modules() if isinstance(module, torch.nn.Conv2d)]
+    assert [module.out_channels for module in convolutions] == widths
+    assert [module.kernel_size[0] for module in convolutions] == [7, 5, 3, 3, 3][: len(widths)]
+    assert model(torch.randn(2, 20, 64)).position_m.shape == (2, 3)
+
+
+def test_no_layers_are_refused() -> None:
+    with pytest.raises(ConfigError, match="layers is 0; give 1 or more"):
+        SurfCNN(input_shape=[20, 64], layers=0)
+
+
 def test_headline() -> None:
     assert SurfCNN(input_shape=[100, 64], channels=[4], kernels=[3], units=8).headline == "N=100"

@@ -27,9 +27,9 @@ class ImageDataModule(SceneDataModule):
         val_fraction: part of the training split kept for validation, in whole blocks of the trajectory; 0 for none.
         batch_size: frames in a training batch.
         eval_batch_size: frames in a batch where no gradient is needed.
-        feature_pool: in training, draw the features of each frame at random from this many of its strongest, anew
-            in every epoch, so that no frame is known by heart; validation and test read the strongest. None never
-            draws. For extractors of local features only, and at most the 300 that the cache holds, or N.
+        feature_pool: in training, draw the N features of each frame at random from so many times N of its strongest,
+            anew in every epoch, so that no frame is known by heart; validation and test read the N strongest. None
+            never draws. For extractors of local features only; the pool ends with the 300 that the cache holds.
         cache_dir: where extracted features are kept; the user's cache folder if not given.
         workers: processes or threads that extract features; every core if not given.
         room_seed: which synthetic room.
@@ -48,7 +48,7 @@ class ImageDataModule(SceneDataModule):
         val_fraction: float = 0.1,
         batch_size: int = 64,
         eval_batch_size: int = 256,
-        feature_pool: int | None = None,
+        feature_pool: float | None = None,
         cache_dir: str | None = None,
         workers: int | None = None,
         room_seed: int = 0,
@@ -75,14 +75,12 @@ class ImageDataModule(SceneDataModule):
         return batch_loader(train, self.batch_size, shuffle=True)
 
 
-def _pooled(extractor: FeatureExtractor, feature_pool: int) -> LocalExtractor:
-    """The extractor with `feature_pool` features a frame, out of the same cache."""
+def _pooled(extractor: FeatureExtractor, times: float) -> LocalExtractor:
+    """The extractor with so many times its features a frame, out of the same cache."""
     if not isinstance(extractor, LocalExtractor):
         raise ConfigError(f"data.feature_pool needs local features, and {extractor.name} has none; leave it out")
-    if not extractor.n_features <= feature_pool <= extractor.n_stored:
-        raise ConfigError(
-            f"data.feature_pool is {feature_pool}; give {extractor.n_features} (n_features) to {extractor.n_stored}"
-        )
+    if not times >= 1:
+        raise ConfigError(f"data.feature_pool is {times}; give how many times n_features it holds, such as 1.5")
     pooled = copy(extractor)
-    pooled.n_features = feature_pool
+    pooled.n_features = round(min(times * extractor.n_features, extractor.n_stored))
     return pooled
