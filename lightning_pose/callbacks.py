@@ -74,9 +74,11 @@ class RunRecorder(Callback):
 
     Attributes:
         config_yaml: the command line's whole configuration, kept in the run as `config.yaml`; None for none.
+        keeps_checkpoints: whether the run has them as artifacts.
     """
 
     config_yaml: str | None = None
+    keeps_checkpoints: bool = True
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         logger = run_logger(trainer)
@@ -124,7 +126,7 @@ class RunRecorder(Callback):
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         logger = run_logger(trainer)
-        if logger is not None:
+        if logger is not None and self.keeps_checkpoints:
             for file in sorted(checkpoint_folder(trainer).glob("*.ckpt")):
                 logger.client.log_artifact(str(logger.run_id), str(file), "checkpoints")
 

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
-from collections.abc import Callable, Sequence
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import NamedTuple
 
 import torch
@@ -11,7 +15,11 @@ from torch import Tensor
 
 from lightning_pose.errors import ConfigError
 
-__all__ = ["Moments", "Ridge", "Spectrum"]
+__all__ = ["Moments", "Ridge", "Spectrum", "shared_factors"]
+
+_KEPT = 4  # factorisations at a time: with and without the validation frames, for two kinds of features
+_sharing = ContextVar("_sharing", default=False)
+_factors: OrderedDict[bytes, tuple[Tensor, Tensor]] = OrderedDict()
 
 _BLOCKS = 8  # of the Gram matrix's columns: the upper triangle takes 36 of 64 products
 
@@ -56,6 +64,33 @@ class Spectrum(NamedTuple):
                 "components; give fewer, or more training frames"
             )
         return Spectrum(self.values[:components], self.vectors[:, :components], self.mean)
+
+
+@contextmanager
+def shared_factors() -> Iterator[None]:
+    """Within it, features are factorised once, however many lambdas or numbers of components follow one another.
+
+    The factorisations outlive it, and are found again by what the features hold. One lambda alone is solved faster
+    without, which is why this is not the rule.
+    """
+    token = _sharing.set(True)
+    try:
+        yield
+    finally:
+        _sharing.reset(token)
+
+
+def _factorise(gram: Tensor) -> tuple[Tensor, Tensor]:
+    """Eigenvalues, ascending, and eigenvectors of a symmetric matrix, given by its upper triangle."""
+    if not _sharing.get():
+        return torch.linalg.eigh(gram, UPLO="U")
+    key = hashlib.blake2b(gram.contiguous().cpu().numpy().data, digest_size=20).digest()
+    if key not in _factors:
+        _factors[key] = torch.linalg.eigh(gram, UPLO="U")
+        while len(_factors) > _KEPT:
+            _factors.popitem(last=False)
+    _factors.move_to_end(key)
+    return _factors[key]
 
 
 class Moments:
@@ -110,7 +145,7 @@ class Moments:
         """Minimise |Y - X W|^2 + lambda |W|^2 (thesis, eq. 5.2) for each lambda; the bias is not penalised.
 
         One eigendecomposition serves all lambdas and the principal components. A single lambda on all features of
-        many frames takes a Cholesky factorisation, a tenth of its time.
+        many frames takes a Cholesky factorisation, a tenth of its time; not in `shared_factors`, where others follow.
 
         Args:
             lambdas: each above 0.
@@ -120,7 +155,7 @@ class Moments:
             ConfigError: there are fewer components.
         """
         mean, cross = self._mean_and_cross()
-        if self._n_folded and components is None and len(lambdas) == 1:
+        if self._n_folded and components is None and len(lambdas) == 1 and not _sharing.get():
             self._gram.diagonal().add_(lambdas[0])
             factor = torch.linalg.cholesky(self._gram, upper=True)
             self._gram.diagonal().sub_(lambdas[0])
@@ -141,12 +176,12 @@ class Moments:
         if self._n_folded:
             self._fold()
             mean = self._mean
-            values, vectors = torch.linalg.eigh(self._gram, UPLO="U")
+            values, vectors = _factorise(self._gram)
         else:
             rows = self._rows[: self._n_rows]
             mean = rows.mean(0)
             x = (rows - mean)[:, : self._sizes[0]]
-            values, vectors = torch.linalg.eigh(x @ x.T)
+            values, vectors = _factorise(x @ x.T)
             # Eigenvectors over frames span those over features, but for what the null space would divide by 0.
             vectors = x.T @ (vectors / values.clamp(min=torch.finfo(values.dtype).tiny).sqrt())
         kept = values > values[-1] * len(values) * torch.finfo(values.dtype).eps

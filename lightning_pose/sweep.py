@@ -141,7 +141,7 @@ def _best_so_far(study: Study, plan: Plan) -> str:
 
 def _conclude(study: Study, plan: Plan, client: MlflowClient, parent: str, folder: Path) -> None:
     """Print the best trials, and keep their config and figures in a folder and in the study's run."""
-    from lightning_pose.sweeps.results import best_trial, draw_figures, table, tally, write_best
+    from lightning_pose.sweeps.results import best_trial, draw_figures, show_study, table, tally, write_best
     from lightning_pose.sweeps.trial import REASON
 
     best = best_trial(study, plan)
@@ -152,15 +152,23 @@ def _conclude(study: Study, plan: Plan, client: MlflowClient, parent: str, folde
             f"no trial of {study.study_name} has ended with a value ({tally(study) or 'none ran'}); {why}"
         )
     folder.mkdir(parents=True, exist_ok=True)
-    config = write_best(best, study, plan, folder)
-    client.log_artifact(parent, str(config))
+    files, rows = show_study(study, plan, folder)
+    for file in files:
+        client.log_artifact(parent, str(file), "study")
     for file in draw_figures(study, plan, folder):
         client.log_artifact(parent, str(file), "figures")
     for objective, value in zip(plan.objectives, best.values, strict=True):
         client.log_metric(parent, f"best/{objective.metric}", value)
     client.set_tag(parent, "sweep.best_trial", str(best.number))
-    Console().print(table(study, plan))
-    print(f"{tally(study)}\nbest config and figures in {folder}\npython -m lightning_pose fit --config {config}")
+    if rows is None or plan.measure is None:
+        Console().print(table(study, plan))
+    if rows is not None:
+        Console().print(rows)
+    print(f"{tally(study)}\nfigures and tables in {folder}")
+    if plan.measure != "features":
+        config = write_best(best, study, plan, folder)
+        client.log_artifact(parent, str(config))
+        print(f"the best on validation frames: python -m lightning_pose fit --config {config}")
 
 
 def _split(argv: list[str]) -> tuple[list[str], dict[str, Any]]:

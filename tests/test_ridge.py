@@ -12,7 +12,7 @@ from sklearn.linear_model import Ridge
 from sklearn.pipeline import make_pipeline
 
 from lightning_pose.errors import ConfigError
-from lightning_pose.ridge import Moments
+from lightning_pose.ridge import Moments, shared_factors
 
 SIZES = {"few frames": (60, 90), "as many as features": (80, 80), "one more": (81, 80), "many frames": (700, 50)}
 sizes = pytest.mark.parametrize(("n", "d"), SIZES.values(), ids=SIZES)
@@ -148,3 +148,38 @@ def test_more_components_than_there_are_is_refused(n: int, d: int) -> None:
     rank = min(n - 1, d)
     with pytest.raises(ConfigError, match=f"components is 1000, .* only {rank} principal components; give fewer"):
         moments(x, y).ridge([1.0], components=1000)
+
+
+@pytest.mark.parametrize("frames", [30, 90], ids=["fewer frames than features", "more"])
+def test_shared_factors_factorise_once_and_solve_the_same(frames: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    torch.manual_seed(0)
+    x, y = torch.randn(frames, 40).double(), torch.randn(frames, 3).double()
+
+    def moments() -> Moments:
+        made = Moments(40, 3)
+        made.add(x, y)
+        return made
+
+    alone = [moments().ridge([strength])[0] for strength in (0.5, 5.0)] + moments().ridge([1.0], components=7)
+    factorised = []
+    eigh = torch.linalg.eigh
+    monkeypatch.setattr(torch.linalg, "eigh", lambda *args, **kwargs: factorised.append(1) or eigh(*args, **kwargs))
+    shared = []
+    for strength, components in ((0.5, None), (5.0, None), (1.0, 7)):
+        with shared_factors():  # as the trials of a study are: one after the other
+            shared += moments().ridge([strength], components)
+    assert len(factorised) == 1
+    for ours, theirs in zip(shared, alone, strict=True):
+        torch.testing.assert_close(ours, theirs)
+
+
+def test_other_features_are_factorised_anew() -> None:
+    solved = []
+    for seed in (0, 1, 0):
+        torch.manual_seed(seed)
+        moments = Moments(5, 2)
+        moments.add(torch.randn(20, 5).double(), torch.randn(20, 2).double())
+        with shared_factors():
+            solved += moments.ridge([1.0])
+    torch.testing.assert_close(solved[0], solved[2])
+    assert not torch.allclose(solved[0].weight, solved[1].weight)

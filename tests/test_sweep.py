@@ -22,7 +22,8 @@ from lightning_pose.sweeps.plan import read_plan
 from lightning_pose.sweeps.study import shown
 from tests.helpers import REPOSITORY, Workplace
 
-SWEEPS = sorted((REPOSITORY / "sweeps").glob("*.yaml"))
+CONFIGS = sorted((REPOSITORY / "configs").glob("*.yaml"))
+SWEEPS = sorted((REPOSITORY / "sweeps").rglob("*.yaml"))
 UNITS = {"model.units": {"type": "int", "low": 4, "high": 40}}
 SHORT = {"trainer.max_epochs": 1}
 Sweep = Callable[..., Path]
@@ -53,19 +54,24 @@ def parent_and_children(workplace: Workplace) -> tuple[Run, list[Run]]:
     return parent, children
 
 
+def setting(config: dict[str, Any], key: str) -> Any:
+    """One value of a config file's content, by its dotted name without `init_args`."""
+    node: Any = config
+    *above, last = key.split(".")
+    for part in above:
+        node = node[part] if part in node else node["init_args"][part]
+    return node[last] if last in node else node["init_args"][last]
+
+
 @pytest.mark.parametrize("file", SWEEPS, ids=lambda path: path.stem)
 def test_every_sweep_file_fits_its_base_config(file: Path) -> None:
     plan = read_plan(file, {"data.root": "somewhere/fire"})
-    first = {parameter.key: parameter.example()[0] for parameter in plan.space}
+    first = {parameter.key: parameter.example()[0] for parameter in plan.space if not parameter.when}
     config = plan.config(first)
-    assert config["data"]["init_args"]["root"] == "somewhere/fire"
+    assert setting(config, "data.root") == "somewhere/fire"
     for key, value in first.items():
-        node = config
-        *above, last = key.split(".")
-        for part in above:
-            node = node[part]
-            node = node.get("init_args", node)
-        assert node[last] == value
+        if key != "base":
+            assert setting(config, key) == value
     assert plan.scene == "fire"
     assert file.read_text().startswith("# "), "a sweep says what it searches"
 
@@ -87,8 +93,16 @@ def test_a_password_is_not_shown() -> None:
     assert shown("postgresql://ada:secret@host/db") == "postgresql://ada:***@host/db"
 
 
-def test_there_are_sweep_files() -> None:
-    assert {"surf_lstm", "surf_cnn", "node_pose", "dense_posenet", "cnn_3d"} <= {file.stem for file in SWEEPS}
+def test_every_architecture_has_a_sweep_file() -> None:
+    assert {file.stem for file in CONFIGS} - {"quickstart"} == {
+        file.stem for file in SWEEPS if file.parent.name == "sweeps"
+    }
+
+
+def test_the_thesis_has_its_studies() -> None:
+    figures = "2_1 2_2 2_4 2_5 2_6 3_4 3_5 3_6 4_3 4_5 4_6 4_7 5_3 5_4 6_4 6_6".split()
+    studies = {*(f"figure_{number}" for number in figures), "table_3_1", "table_5_1"}
+    assert studies == {file.stem for file in SWEEPS if file.parent.name == "thesis"}
 
 
 def test_a_sweep_leaves_runs_and_a_config_that_trains_and_goes_on(

@@ -38,6 +38,7 @@ class TestReport(Callback):
         self.log_model = log_model
         self.visual_odometry = visual_odometry
         self.results: dict[str, Mapping[str, float]] = {}
+        self.evaluation: Evaluation | None = None
         self._poses: list[Pose] = []
 
     def on_test_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -61,6 +62,7 @@ class TestReport(Callback):
         else:
             assert isinstance(pl_module, PoseModule)
             found = evaluate_images(trainer, pl_module, self._poses, model)
+        self.evaluation = found
         self.results = {type(pl_module).__name__: model, **found.baselines}
         scene = trainer.datamodule.scene  # type: ignore[attr-defined]
         print_results(self.results, f"{scene.name}, {pl_module.headline}", found.extras)

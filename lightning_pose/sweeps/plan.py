@@ -1,8 +1,7 @@
-"""The plan of a sweep: its file, read and checked against its base config, before anything is trained."""
+"""The plan of a sweep: its file, read and checked against its base configs, before anything is trained."""
 
 from __future__ import annotations
 
-import copy
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,19 +9,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
-from lightning_pose.cli import PoseCLI
 from lightning_pose.errors import ConfigError
 from lightning_pose.summary import summarize_errors
+from lightning_pose.sweeps.config import ParsedConfig, check_known, keys, options, put, read_yaml, resolve
+from lightning_pose.sweeps.exhibit import BASE, MEASURES, Exhibit, parse_exhibit
 from lightning_pose.sweeps.space import Parameter, nearest, parse_space
 from lightning_pose.tracking import default_tracking_uri
 
 __all__ = ["Objective", "Plan", "read_plan"]
 
-FIELDS = ("base", "objective", "sampler", "pruner", "n_trials", "seed", "settings", "space")
-COSTS = ("cost/parameters", "cost/train_seconds")
+FIELDS = ("base", "objective", "sampler", "pruner", "n_trials", "seed", "settings", "space", "measure", "figure")
+COSTS = ("cost/parameters", "cost/layers", "cost/train_seconds", "cost/ms_per_frame", "cost/features_ms_per_frame")
 MEASURED = [f"val/{name}" for name in ("loss", *summarize_errors(np.zeros(1), np.zeros(1)))]
+FEATURES = ("features/count_median", "features/count_mean")
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Plan:
 
     Attributes:
         file: the sweep file.
-        base: the base config.
+        bases: the base configs by name; where there are several, the parameter `base` says which a trial has.
         objectives: one or several.
         sampler: name and options.
         pruner: name and options.
@@ -47,11 +47,14 @@ class Plan:
         seed: of the sampler.
         settings: what is fixed for all trials on top of the base config, by dotted key.
         space: what is searched.
-        resolved: the whole config with `settings`, defaults included.
+        measure: `test` where trials measure the test frames too, which choose nothing; `features` where they measure
+            features and train nothing; else None.
+        exhibit: the figure and table that the study ends in, if any.
+        resolved: the first base's whole config with `settings`, defaults included.
     """
 
     file: Path
-    base: Path
+    bases: Mapping[str, Path]
     objectives: tuple[Objective, ...]
     sampler: Mapping[str, Any]
     pruner: Mapping[str, Any]
@@ -59,14 +62,22 @@ class Plan:
     seed: int
     settings: Mapping[str, Any]
     space: tuple[Parameter, ...]
+    measure: str | None
+    exhibit: Exhibit | None
     resolved: Mapping[str, Any]
 
     @property
     def scene(self) -> str:
         """Name of the scene that its trials train on: the folder's, or `room` for synthetic ones."""
         data = self.resolved["data"]["init_args"]
+        searched = [p.example() for p in self.space if p.key == "data.root"]
         roots = [data["root"]] if data.get("root") else data.get("train_scenes") or []
-        return "+".join(Path(root).name for root in roots) or "room"
+        return "+".join(Path(root).name for root in (searched[0] if searched else roots) if root) or "room"
+
+    @property
+    def system(self) -> str:
+        """The architecture's name, or those of several."""
+        return "+".join(self.bases) if len(self.bases) > 1 else self.resolved["model"]["class_path"].rpartition(".")[2]
 
     @property
     def tracking(self) -> tuple[str, str]:
@@ -74,21 +85,30 @@ class Plan:
         logger = self.resolved["trainer"]["logger"]["init_args"]
         return logger["tracking_uri"] or default_tracking_uri(logger["root"]), logger["experiment_name"]
 
+    def base(self, values: Mapping[str, Any]) -> Path:
+        """The base config of a trial."""
+        return self.bases[values.get(BASE, next(iter(self.bases)))]
+
+    def changes(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """The settings of a trial on top of its base config: the sweep's and its own."""
+        return {**self.settings, **{key: value for key, value in values.items() if key != BASE}}
+
     def arguments(self, values: Mapping[str, Any]) -> list[str]:
         """The command line of a trial, without its verb: base config, settings, and the trial's values."""
-        return ["--config", str(self.base), *_options({**self.settings, **values})]
+        return ["--config", str(self.base(values)), *options(self.changes(values))]
 
     def config(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """The base config with settings and values put in, as a config file has it."""
-        config = _read_yaml(self.base, "base config")
-        full = _Config(self.arguments(values)).config.as_dict()
-        for key, value in {**self.settings, **values}.items():
-            _put(config, full, key.split("."), value)
+        config = read_yaml(self.base(values), "base config")
+        full = ParsedConfig(self.arguments(values)).config.as_dict()
+        for key, value in self.changes(values).items():
+            put(config, full, key.split("."), value)
         return config
 
     def describe(self) -> dict[str, str]:
         """What a study cannot change between two commands: the space, the objectives, and what the trials share."""
-        fixed = {"config": _read_yaml(self.base, "base config"), "settings": dict(self.settings)}
+        configs = {name: read_yaml(file, "base config") for name, file in self.bases.items()}
+        fixed = {"configs": configs, "settings": dict(self.settings), "measure": self.measure}
         return {
             "search space": json.dumps({p.key: p.describe() for p in self.space}, sort_keys=True),
             "objectives": json.dumps([[o.metric, o.maximize] for o in self.objectives]),
@@ -96,74 +116,83 @@ class Plan:
         }
 
 
-class _Config(PoseCLI):
-    """A command line that is parsed and checked, and then not run."""
-
-    def __init__(self, args: list[str]) -> None:
-        super().__init__(args, run=False)
-
-    def _set_seed(self) -> None:
-        """Not yet."""
-
-    def instantiate_classes(self) -> None:
-        """Nothing."""
-
-
 def read_plan(file: Path, overrides: Mapping[str, Any]) -> Plan:
     """Read a sweep file and check every part of it.
 
     Args:
         file: YAML.
-        overrides: settings of the command line, which win over the file's.
+        overrides: settings of the command line, which win over the file's: one that is searched is searched no more,
+            and `space.KEY` replaces what is searched of a key.
 
     Raises:
-        ConfigError: the file or its base config is missing or malformed, a key is unknown, or a value is refused.
+        ConfigError: the file or a base config is missing or malformed, a key is unknown, or a value is refused.
     """
-    raw = _read_yaml(file, "sweep file")
+    raw = read_yaml(file, "sweep file")
     for field in raw:
         if field not in FIELDS:
             raise ConfigError(f"{file} has an unknown entry {field!r}; {nearest(str(field), FIELDS)}")
-    base = _find_base(file, raw.get("base"))
+    bases = _find_bases(file, raw.get("base"))
+    measure = raw.get("measure")
+    if measure not in MEASURES:
+        raise ConfigError(f"measure is {measure!r}; give test or features, or leave it out")
     settings = {str(key).replace(".init_args.", "."): value for key, value in (raw.get("settings") or {}).items()}
-    settings |= overrides
-    space = parse_space(raw.get("space"))
-    settings, resolved = _check_keys(base, settings, space)
+    space = _space(raw.get("space"), bases, overrides)
+    settings |= {key: value for key, value in overrides.items() if not key.startswith("space.")}
+    settings, resolved = _check_keys(bases, settings, space)
     plan = Plan(
         file=file,
-        base=base,
-        objectives=_parse_objectives(raw.get("objective", "val/loss")),
+        bases=bases,
+        objectives=_parse_objectives(
+            raw.get("objective", FEATURES[0] if measure == "features" else "val/loss"), measure
+        ),
         sampler=_named(raw.get("sampler", "tpe"), "sampler"),
-        pruner=_named(raw.get("pruner", "default"), "pruner"),
+        pruner=_named(raw.get("pruner", "none" if measure else "default"), "pruner"),
         n_trials=_whole(raw.get("n_trials"), "n_trials"),
         seed=_whole(raw.get("seed"), "seed") or 0,
         settings=settings,
         space=tuple(space),
+        measure=measure,
+        exhibit=parse_exhibit(raw.get("figure"), measure, space),
         resolved=resolved,
     )
     if not str((resolved["trainer"]["logger"] or {}).get("class_path", "")).endswith("MLflowLogger"):
+        base = next(iter(bases.values()))
         raise ConfigError(f"{base} has another trainer.logger, but a sweep keeps its trials in MLflow; leave it out")
     return plan
 
 
-def _read_yaml(file: Path, what: str) -> dict[str, Any]:
-    try:
-        content = yaml.safe_load(file.read_text())
-    except OSError as error:
-        raise ConfigError(f"the {what} {file} cannot be read ({error.strerror}); check the path") from error
-    except (UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ConfigError(f"the {what} {file} is not YAML ({' '.join(str(error).split())}); correct it") from error
-    if not isinstance(content, dict):
-        raise ConfigError(f"the {what} {file} is no mapping; see sweeps/surf_cnn.yaml")
-    return content
-
-
-def _find_base(file: Path, base: Any) -> Path:
-    if not isinstance(base, str):
+def _find_bases(file: Path, entry: Any) -> dict[str, Path]:
+    entries = entry if isinstance(entry, list) else [entry]
+    if not entries or not all(isinstance(name, str) for name in entries):
         raise ConfigError(f"{file} names no base config; add a line such as `base: configs/surf_cnn.yaml`")
+    found = [_find_base(file, name) for name in entries]
+    bases = {path.stem: path for path in found}
+    if len(bases) < len(found):
+        raise ConfigError(f"{file} names base configs of the same file name, {', '.join(map(str, found))}; rename one")
+    return bases
+
+
+def _find_base(file: Path, base: str) -> Path:
     for folder in (file.parent, Path(), Path(__file__).parents[2]):
         if (folder / base).is_file():
             return folder / base
     raise ConfigError(f"{file} names the base config {base}, which is not there; give its path from the sweep file")
+
+
+def _space(raw: Any, bases: Mapping[str, Path], overrides: Mapping[str, Any]) -> list[Parameter]:
+    """The search space, with the base config as its first parameter where there are several."""
+    entries = (
+        {str(key).replace(".init_args.", "."): entry for key, entry in raw.items()} if isinstance(raw, dict) else {}
+    )
+    for key, value in overrides.items():
+        name = key.removeprefix("space.")
+        if name != key:
+            entries[name] = value
+        elif key in entries:
+            entries[key] = [value]
+    if len(bases) > 1:
+        entries = {BASE: list(bases), **entries}
+    return parse_space(entries or raw)
 
 
 def _named(entry: Any, what: str) -> dict[str, Any]:
@@ -180,22 +209,24 @@ def _whole(value: Any, what: str) -> int | None:
     return value
 
 
-def _parse_objectives(raw: Any) -> tuple[Objective, ...]:
+def _parse_objectives(raw: Any, measure: str | None) -> tuple[Objective, ...]:
     entries = raw if isinstance(raw, list) else [raw]
     if not entries:
         raise ConfigError("objective is empty; give val/loss, or leave it out")
-    return tuple(_parse_objective(entry) for entry in entries)
+    return tuple(
+        _parse_objective(entry, FEATURES if measure == "features" else (*MEASURED, *COSTS)) for entry in entries
+    )
 
 
-def _parse_objective(entry: Any) -> Objective:
+def _parse_objective(entry: Any, known: Sequence[str]) -> Objective:
     named = {"metric": entry} if isinstance(entry, str) else entry
     if not isinstance(named, dict) or not isinstance(named.get("metric"), str) or named.keys() - {"metric", "goal"}:
         raise ConfigError(f"objective is {entry!r}; give a metric, or {{metric: val/loss, goal: minimize}}")
     metric = named["metric"]
     if metric.startswith(("test/", "baseline/")):
         raise ConfigError(f"objective {metric} is measured on test frames, which must not choose; take its val/ name")
-    if metric not in (*MEASURED, *COSTS):
-        raise ConfigError(f"objective {metric} is not known; {nearest(metric, [*MEASURED, *COSTS])}")
+    if metric not in known:
+        raise ConfigError(f"objective {metric} is not known; {nearest(metric, known)}")
     goal = named.get("goal", "maximize" if "recall" in metric else "minimize")
     if goal not in ("minimize", "maximize"):
         raise ConfigError(f"objective {metric} has goal {goal!r}; give minimize or maximize")
@@ -203,82 +234,34 @@ def _parse_objective(entry: Any) -> Objective:
 
 
 def _check_keys(
-    base: Path, settings: Mapping[str, Any], space: Sequence[Parameter]
+    bases: Mapping[str, Path], settings: Mapping[str, Any], space: Sequence[Parameter]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Every key exists, in the base config or under a class that is searched, and has values of the right type.
+    """Every key exists, in its base config or under a class that is searched, and has values of the right type.
 
     Returns:
-        The settings, a class by the name of its `class_path`, and the whole config with them.
+        The settings, a class by the name of its `class_path`, and the first base's whole config with them.
     """
-    cli = _Config(["--config", str(base)])
-    known = _keys(cli.config.as_dict())
-    for key in settings:
-        _check_known(key, known, "")
-    settings = {
-        f"{key}.class_path" if isinstance(value, str) and f"{key}.class_path" in known else key: value
-        for key, value in settings.items()
-    }
-    resolved = cli.parser.parse_args(["--config", str(base), *_options(settings)]).as_dict()
-    known |= _keys(resolved)
-    classes = [p for p in space if p.key.endswith(".class_path")]
+    found = [_check_base(name, file, settings, [p for p in space if p.key != BASE]) for name, file in bases.items()]
+    return found[0]
+
+
+def _check_base(
+    name: str, base: Path, settings: Mapping[str, Any], space: Sequence[Parameter]
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    cli, named, resolved = resolve(base, settings)
+    known = keys(cli.config.as_dict()) | keys(resolved)
+    own = [parameter for parameter in space if name in (parameter.when or {}).get(BASE, (name,))]
+    classes = [parameter for parameter in own if parameter.key.endswith(".class_path")]
     for parameter in classes:
         for choice in parameter.example():
-            chosen = ["--config", str(base), *_options({**settings, parameter.key: choice})]
-            known |= _keys(cli.parser.parse_args(chosen).as_dict())
-    for parameter in space:
-        _check_known(parameter.key, known, "space.")
-        if parameter.when or classes:
+            known |= keys(cli.parse(["--config", str(base), *options({**named, parameter.key: choice})]))
+    for parameter in own:
+        check_known(parameter.key, known, "space.")
+        if classes or set(parameter.when or ()) - {BASE}:
             continue  # it may suit some trials alone, which say so
         for value in parameter.example():
             try:
-                cli.parser.parse_args(["--config", str(base), *_options({**settings, parameter.key: value})])
+                cli.parse(["--config", str(base), *options({**named, parameter.key: value})])
             except ConfigError as error:
                 raise ConfigError(f"space.{parameter.key} cannot be {value!r}: {error}") from error
-    return settings, resolved
-
-
-def _check_known(key: str, known: Mapping[str, Any], where: str) -> None:
-    parts = key.split(".")
-    above = [".".join(parts[:n]) for n in range(2, len(parts))]
-    # What is below a setting that is null by default is the parser's to judge.
-    if key not in known and not any(name in known and known[name] is None for name in above):
-        raise ConfigError(f"{where}{key} is no setting of the base config; {nearest(key, list(known))}")
-
-
-def _keys(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Every setting by its dotted name without `init_args`, and every group of settings."""
-    keys: dict[str, Any] = {}
-    for name, value in config.items():
-        key = prefix if name == "init_args" else f"{prefix}.{name}" if prefix else str(name)
-        if isinstance(value, Mapping):
-            keys |= {key: value} if name != "init_args" else {}
-            keys |= _keys(value, key)
-        else:
-            keys[key] = value
-    return keys
-
-
-def _options(values: Mapping[str, Any]) -> list[str]:
-    """Settings as words of a command line; a class before its arguments, because it drops those it does not have."""
-    ordered = sorted(values.items(), key=lambda item: not item[0].endswith(".class_path"))
-    return [
-        f"--{key.removesuffix('.class_path')}={value if isinstance(value, str) else json.dumps(value)}"
-        for key, value in ordered
-    ]
-
-
-def _put(config: dict[str, Any], full: Mapping[str, Any], parts: Sequence[str], value: Any) -> None:
-    """Set one value in a config file's content, through the `init_args` that the whole config has on the way."""
-    head, *rest = parts
-    if "init_args" in full and head != "class_path":
-        config.setdefault("class_path", full["class_path"])
-        config = config.setdefault("init_args", {})
-        full = full["init_args"]
-    if not rest:
-        if head == "class_path" and "init_args" in config:
-            config["init_args"] = {k: v for k, v in config["init_args"].items() if k in full.get("init_args", {})}
-        config[head] = copy.deepcopy(value)
-        return
-    if not isinstance(config.get(head), dict):
-        config[head] = {}
-    _put(config[head], full.get(head) or {}, rest, value)
+    return named, resolved

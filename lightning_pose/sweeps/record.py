@@ -31,7 +31,7 @@ def open_parent(study: Study, plan: Plan) -> tuple[MlflowClient, str]:
         study.set_user_attr(RUN, run)
         tags = {
             "verb": "sweep",
-            "architecture": plan.resolved["model"]["class_path"].rpartition(".")[2],
+            "architecture": plan.system,
             "scene": plan.scene,
             "sweep.study": study.study_name,
             "sweep.sampler": plan.sampler["name"],
@@ -40,7 +40,8 @@ def open_parent(study: Study, plan: Plan) -> tuple[MlflowClient, str]:
         for name, value in tags.items():
             client.set_tag(run, name, value)
         client.log_artifact(run, str(plan.file))
-        client.log_artifact(run, str(plan.base))
+        for base in plan.bases.values():
+            client.log_artifact(run, str(base))
     return client, run
 
 

@@ -1,4 +1,4 @@
-"""What a sweep leaves: the best config, figures, and a table of the best trials."""
+"""What a sweep leaves: the best config, figures, a table of the best trials, and a study's own figure and table."""
 
 from __future__ import annotations
 
@@ -12,10 +12,14 @@ from optuna import Study
 from optuna.trial import FrozenTrial, TrialState
 from rich.table import Table
 
+from lightning_pose.sweeps.cells import as_csv, as_markdown, as_table, gather
+from lightning_pose.sweeps.config import ParsedConfig
+from lightning_pose.sweeps.drawing import draw_cells, draw_keypoints
+from lightning_pose.sweeps.features import keypoints_of_a_frame
 from lightning_pose.sweeps.plan import Objective, Plan
 from lightning_pose.sweeps.trial import REASON
 
-__all__ = ["best_trial", "best_trials", "completed", "draw_figures", "table", "tally", "write_best"]
+__all__ = ["best_trial", "best_trials", "completed", "draw_figures", "show_study", "table", "tally", "write_best"]
 
 SHOWN = 10
 
@@ -46,7 +50,8 @@ def write_best(trial: FrozenTrial, study: Study, plan: Plan, folder: Path) -> Pa
     """Write `best.yaml`, which `fit --config` takes."""
     values = {p.key: p.value(trial.params[p.key]) for p in plan.space if p.key in trial.params}
     reached = ", ".join(f"{o.metric} {v:.6g}" for o, v in zip(plan.objectives, trial.values, strict=True))
-    head = f"# Trial {trial.number} of the sweep {study.study_name} of {plan.base.name}: {reached}.\n"
+    base = plan.base(values).name
+    head = f"# Trial {trial.number} of the sweep {study.study_name} of {base}: {reached}.\n"
     file = folder / "best.yaml"
     file.write_text(head + yaml.safe_dump(plan.config(values), sort_keys=False))
     return file
@@ -57,7 +62,7 @@ def table(study: Study, plan: Plan) -> Table:
     several = len(plan.objectives) > 1
     shown = Table(title=f"{study.study_name}: {'Pareto front' if several else 'best trials'}", title_justify="left")
     keys = [parameter.key for parameter in plan.space]
-    for name in ("trial", *(o.metric for o in plan.objectives), *keys):
+    for name in ("trial", *(o.metric for o in plan.objectives), *_last_names(keys)):
         shown.add_column(name, justify="right", overflow="fold")
     for trial in best_trials(study, plan)[:SHOWN]:
         params = [_short(trial.params.get(key, "")) for key in keys]
@@ -66,6 +71,35 @@ def table(study: Study, plan: Plan) -> Table:
     if failed:
         shown.caption = f"trial {failed[-1].number} failed: {failed[-1].user_attrs[REASON]}"
     return shown
+
+
+def _last_names(keys: list[str]) -> list[str]:
+    """Keys without what they are in, where that leaves them apart: a terminal is narrow."""
+    last = [key.rpartition(".")[2] for key in keys]
+    return [name if last.count(name) == 1 else key for name, key in zip(last, keys, strict=True)]
+
+
+def show_study(study: Study, plan: Plan, folder: Path) -> tuple[list[Path], Table | None]:
+    """Draw a study's figure, and write its table as `table.md` and, with all that was measured, as `table.csv`.
+
+    Returns:
+        The files, and the table for the terminal; none for pictures, which have no numbers.
+    """
+    exhibit = plan.exhibit
+    if exhibit is None:
+        return [], None
+    cells = gather(study, plan)
+    title = exhibit.title or study.study_name
+    figure = folder / "figure.png"
+    if exhibit.kind == "pictures":
+        shown = [ParsedConfig(plan.arguments(cell.values)) for cell in cells if cell.metrics]
+        frames = [keypoints_of_a_frame(config) for config in shown]
+        draw_keypoints({frame.scene: frame for frame in frames}, title).savefig(figure)
+    else:
+        draw_cells(cells, exhibit, f"{title}, {plan.scene}").savefig(figure)
+    (folder / "table.csv").write_text(as_csv(cells, plan))
+    (folder / "table.md").write_text(as_markdown(cells, exhibit))
+    return [figure, folder / "table.csv", folder / "table.md"], as_table(cells, exhibit, f"{title}, {plan.scene}")
 
 
 def _short(value: Any) -> str:

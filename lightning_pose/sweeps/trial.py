@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import math
 import os
+import shutil
 import socket
 import traceback
+from collections.abc import Mapping
 from typing import Any
 
 import optuna
@@ -14,17 +18,23 @@ from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from mlflow import MlflowClient
 from optuna import Trial
 
-from lightning_pose.callbacks import train_seconds
+from lightning_pose.callbacks import BestCheckpoint, checkpoint_folder, run_logger
 from lightning_pose.cli import PoseCLI
 from lightning_pose.errors import ConfigError, PoseError
+from lightning_pose.evaluation import TestReport
+from lightning_pose.evaluation.base import costs
+from lightning_pose.ridge import shared_factors
+from lightning_pose.sweeps.config import ParsedConfig
+from lightning_pose.sweeps.features import measure_features
 from lightning_pose.sweeps.plan import Plan
 from lightning_pose.sweeps.space import draw
 from lightning_pose.tracking import HOST_TAG, PROCESS_TAG
 
-__all__ = ["PROCESS", "REASON", "RUN", "process_name", "process_tags", "run_trial"]
+__all__ = ["CURVES", "METRICS", "PROCESS", "REASON", "RUN", "process_name", "process_tags", "run_trial"]
 
 PROCESS, REASON, RUN = "process", "reason", "mlflow_run"
-"""What Optuna keeps of a trial beside its values: who runs it, why it ended early, and its MLflow run."""
+METRICS, CURVES = "metrics", "curves"
+"""What Optuna keeps of a trial beside its values: who runs it, why it ended early, its run, and what it measured."""
 
 
 def process_name() -> str:
@@ -85,27 +95,64 @@ class EpochWatch(Callback):
 
 
 class _TrialCLI(PoseCLI):
-    """`fit` without the test that follows it, without checkpoints, which nothing reads, and without its own bar."""
+    """`fit` without its own bar, and without checkpoints and the test that follows it, unless the study measures that.
 
-    def __init__(self, args: list[str], watch: EpochWatch) -> None:
+    Attributes:
+        measured: metrics beside those of validation frames.
+        curves: metrics over a whole number, such as a clip's length.
+    """
+
+    def __init__(self, args: list[str], watch: EpochWatch, plan: Plan) -> None:
         self.watch = watch
+        self.plan = plan
+        self.measured: dict[str, float] = {}
+        self.curves: Mapping[str, Mapping[int, float]] = {}
         super().__init__(["fit", *args])
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
         trainer = super().instantiate_trainer(**kwargs)
-        kept = [c for c in trainer.callbacks if not isinstance(c, ModelCheckpoint)]  # type: ignore[attr-defined]
+        self.recorder.keeps_checkpoints = False
+        wanted = BestCheckpoint if self.plan.measure == "test" else ()
+        kept = [c for c in trainer.callbacks if not isinstance(c, ModelCheckpoint) or isinstance(c, wanted)]  # type: ignore[attr-defined]
         trainer.callbacks = [*kept, self.watch]  # type: ignore[attr-defined]
         if trainer.progress_bar_callback is not None:
             trainer.progress_bar_callback.disable()
         return trainer
 
     def after_fit(self) -> None:
-        """Nothing: test frames must not choose."""
+        if self.watch.pruned is not None:
+            return
+        if self.plan.measure == "test":
+            self._test()
+        else:  # test frames must not choose
+            self._cost()
 
-    def costs(self) -> dict[str, float]:
+    def _test(self) -> None:
+        """Measure the best epoch on the test frames; for the study's figure alone."""
+        report = next(c for c in self.trainer.callbacks if isinstance(c, TestReport))  # type: ignore[attr-defined]
+        report.log_model = False
+        try:
+            with contextlib.redirect_stdout(io.StringIO()):  # one table a trial would bury the study's
+                super().after_fit()
+        finally:
+            shutil.rmtree(checkpoint_folder(self.trainer), ignore_errors=True)
+        found = report.evaluation
+        assert found is not None, "a test ends in an evaluation"
+        own = next(iter(report.results.values()))
+        self.measured = {f"test/{name}": value for name, value in own.items()} | found.extras
+        for system, metrics in found.baselines.items():
+            self.measured |= {f"baseline/{system}/{name}": value for name, value in metrics.items()}
+        self.curves = found.curves
+
+    def _cost(self) -> None:
         """What the model costs, as far as it is known without test frames."""
-        parameters = sum(p.numel() for p in self.model.network.parameters())
-        return {"cost/parameters": float(parameters), "cost/train_seconds": train_seconds(self.trainer) or 0.0}
+        split = "val" if len(self.datamodule.scene.splits["val"]) else "train"
+        frames = self.datamodule.clip_length if self.model.reads_clips else 1
+        extracts = any(objective.metric == "cost/features_ms_per_frame" for objective in self.plan.objectives)
+        self.measured = costs(self.trainer, self.model.eval(), frames, split, features=extracts)
+        logger = run_logger(self.trainer)
+        if logger is not None:
+            logger.log_metrics(self.measured)
 
 
 def run_trial(trial: Trial, plan: Plan, parent: str) -> float | list[float]:
@@ -138,6 +185,8 @@ def run_trial(trial: Trial, plan: Plan, parent: str) -> float | list[float]:
         for key, value in values.items():
             client.set_tag(run, f"sweep.{key}", str(value))
         logger = [f"--trainer.logger.run_id={run}", f"--trainer.logger.run_name={name}"]
+        if plan.measure == "features":
+            return _features(trial, plan, values, client, run)
         return _fit(trial, plan, [*plan.arguments(values), *logger], client, run)
     except optuna.TrialPruned as pruned:
         _end(trial, client, run, "PRUNED", "KILLED", str(pruned))
@@ -154,12 +203,38 @@ def run_trial(trial: Trial, plan: Plan, parent: str) -> float | list[float]:
 
 def _fit(trial: Trial, plan: Plan, args: list[str], client: MlflowClient, run: str) -> float | list[float]:
     watch = EpochWatch(plan, trial)
-    cli = _TrialCLI(args, watch)
+    with shared_factors():
+        cli = _TrialCLI(args, watch, plan)
     if watch.pruned is not None:
         raise optuna.TrialPruned(watch.pruned)
-    found = watch.values() | cli.costs()
-    for name, value in cli.costs().items():
+    return _keep(trial, plan, watch.values() | cli.measured, cli.curves, client, run)
+
+
+def _features(
+    trial: Trial, plan: Plan, values: Mapping[str, Any], client: MlflowClient, run: str
+) -> float | list[float]:
+    metrics, curves = measure_features(ParsedConfig(plan.arguments(values)))
+    for name, value in metrics.items():
         client.log_metric(run, name, value)
+    for name, curve in curves.items():
+        for number, value in curve.items():
+            client.log_metric(run, name, value, step=number)
+    client.set_terminated(run, "FINISHED")
+    return _keep(trial, plan, metrics, curves, client, run)
+
+
+def _keep(
+    trial: Trial,
+    plan: Plan,
+    found: Mapping[str, float],
+    curves: Mapping[str, Mapping[int, float]],
+    client: MlflowClient,
+    run: str,
+) -> float | list[float]:
+    """Keep what a trial measured where the study's table and figure find it, and hand out the objectives' values."""
+    trial.set_user_attr(METRICS, {name: value for name, value in found.items() if math.isfinite(value)})
+    if curves:
+        trial.set_user_attr(CURVES, {name: list(map(list, curve.items())) for name, curve in curves.items()})
     values = [found[objective.metric] for objective in plan.objectives]
     for objective, value in zip(plan.objectives, values, strict=True):
         client.log_metric(run, f"objective/{objective.metric}", value)

@@ -1,0 +1,123 @@
+"""A base config of a sweep: what settings it has, and what becomes of it when some of them change."""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from lightning_pose.cli import PoseCLI
+from lightning_pose.errors import ConfigError
+from lightning_pose.sweeps.space import nearest
+
+__all__ = ["ParsedConfig", "check_known", "keys", "options", "put", "read_yaml", "resolve"]
+
+
+class ParsedConfig(PoseCLI):
+    """A command line that is parsed and checked, and then not run."""
+
+    def __init__(self, args: list[str]) -> None:
+        super().__init__(args, run=False)
+
+    def _set_seed(self) -> None:
+        """Not yet."""
+
+    def instantiate_classes(self) -> None:
+        """Nothing."""
+
+    def parse(self, args: list[str]) -> dict[str, Any]:
+        """Another command line's whole config, without the time that a new parser takes."""
+        return self.parser.parse_args(args).as_dict()
+
+
+def read_yaml(file: Path, what: str) -> dict[str, Any]:
+    """A YAML file's mapping.
+
+    Raises:
+        ConfigError: there is none; the message calls the file by `what`.
+    """
+    try:
+        content = yaml.safe_load(file.read_text())
+    except OSError as error:
+        raise ConfigError(f"the {what} {file} cannot be read ({error.strerror}); check the path") from error
+    except (UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ConfigError(f"the {what} {file} is not YAML ({' '.join(str(error).split())}); correct it") from error
+    if not isinstance(content, dict):
+        raise ConfigError(f"the {what} {file} is no mapping; see sweeps/surf_cnn.yaml")
+    return content
+
+
+def resolve(base: Path, settings: Mapping[str, Any]) -> tuple[ParsedConfig, dict[str, Any], dict[str, Any]]:
+    """Put settings into a base config.
+
+    Returns:
+        A parser, the settings with a class by the name of its `class_path`, and the whole config, defaults included.
+
+    Raises:
+        ConfigError: a setting is unknown, or a value is refused.
+    """
+    cli = ParsedConfig(["--config", str(base)])
+    known = keys(cli.config.as_dict())
+    for key in settings:
+        check_known(key, known, "")
+    named = {
+        f"{key}.class_path" if isinstance(value, str) and f"{key}.class_path" in known else key: value
+        for key, value in settings.items()
+    }
+    return cli, named, cli.parse(["--config", str(base), *options(named)])
+
+
+def check_known(key: str, known: Mapping[str, Any], where: str) -> None:
+    """Refuse a setting that a config does not have.
+
+    Raises:
+        ConfigError: it has none of this name; the message has the nearest.
+    """
+    parts = key.split(".")
+    above = [".".join(parts[:n]) for n in range(2, len(parts))]
+    # What is below a setting that is null by default is the parser's to judge.
+    if key not in known and not any(name in known and known[name] is None for name in above):
+        raise ConfigError(f"{where}{key} is no setting of the base config; {nearest(key, list(known))}")
+
+
+def keys(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Every setting by its dotted name without `init_args`, and every group of settings."""
+    found: dict[str, Any] = {}
+    for name, value in config.items():
+        key = prefix if name == "init_args" else f"{prefix}.{name}" if prefix else str(name)
+        if isinstance(value, Mapping):
+            found |= {key: value} if name != "init_args" else {}
+            found |= keys(value, key)
+        else:
+            found[key] = value
+    return found
+
+
+def options(values: Mapping[str, Any]) -> list[str]:
+    """Settings as words of a command line; a class before its arguments, because it drops those it does not have."""
+    ordered = sorted(values.items(), key=lambda item: not item[0].endswith(".class_path"))
+    return [
+        f"--{key.removesuffix('.class_path')}={value if isinstance(value, str) else json.dumps(value)}"
+        for key, value in ordered
+    ]
+
+
+def put(config: dict[str, Any], full: Mapping[str, Any], parts: Sequence[str], value: Any) -> None:
+    """Set one value in a config file's content, through the `init_args` that the whole config has on the way."""
+    head, *rest = parts
+    if "init_args" in full and head != "class_path":
+        config.setdefault("class_path", full["class_path"])
+        config = config.setdefault("init_args", {})
+        full = full["init_args"]
+    if not rest:
+        if head == "class_path" and "init_args" in config:
+            config["init_args"] = {k: v for k, v in config["init_args"].items() if k in full.get("init_args", {})}
+        config[head] = copy.deepcopy(value)
+        return
+    if not isinstance(config.get(head), dict):
+        config[head] = {}
+    put(config[head], full.get(head) or {}, rest, value)

@@ -1,0 +1,171 @@
+"""The figure of a study: lines, bars, curves or keypoints, from what its trials measured."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from statistics import fmean
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
+
+from lightning_pose.images import read_rgb
+from lightning_pose.plots import BASELINES, STYLE
+from lightning_pose.sweeps.cells import Cell, named, varying
+from lightning_pose.sweeps.exhibit import Exhibit
+from lightning_pose.sweeps.features import FrameKeypoints
+
+__all__ = ["draw_cells", "draw_keypoints"]
+
+COLORS = matplotlib.color_sequences["petroff8"]
+STRONGEST = (10, 50, 100, 300)
+Lines = dict[str, list[Cell]]
+
+
+@matplotlib.rc_context(STYLE)
+def draw_cells(cells: Sequence[Cell], exhibit: Exhibit, title: str) -> Figure:
+    """One panel a metric; a line, a group of bars or a curve for each combination of the settings that x is not.
+
+    Where a setting was tried with several seeds, lines and bars have the mean, and each trial is a dot.
+
+    Args:
+        cells: what was measured; what failed is left out.
+        exhibit: what to show.
+        title: the heading.
+    """
+    cells = [cell for cell in cells if cell.metrics]
+    lines = _lines(cells, exhibit)
+    figure = Figure(figsize=(5.4 * len(exhibit.y) + 0.4, 4.6), dpi=150, layout="constrained")
+    figure.suptitle(title, x=0.015, ha="left", fontsize=12, fontweight="bold")
+    for axes, metric in zip(np.atleast_1d(figure.subplots(1, len(exhibit.y))), exhibit.y, strict=True):
+        if exhibit.kind == "curve":
+            _curves(axes, lines, metric, exhibit)
+        else:
+            _settings(axes, lines, metric, exhibit)
+        axes.set_ylabel(exhibit.label(metric))
+        if "y" in exhibit.log:
+            axes.set_yscale("log")
+        elif exhibit.kind != "curve":
+            axes.set_ylim(0, 1.05 * axes.get_ylim()[1])
+        if "x" in exhibit.log:
+            axes.set_xscale("log")
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    if len(labels) > 1:
+        figure.legend(handles, labels, loc="outside lower center", ncols=min(4, len(labels)))
+    return figure
+
+
+def _lines(cells: Sequence[Cell], exhibit: Exhibit) -> Lines:
+    """Cells by what tells one line from another."""
+    apart = [key for key in varying(cells) if key != exhibit.x]
+    lines: Lines = {}
+    for cell in cells:
+        parts = [_told(key, cell.values[key], exhibit, len(apart)) for key in apart if key in cell.values]
+        lines.setdefault(", ".join(parts) or "model", []).append(cell)
+    return lines
+
+
+def _told(key: str, value: Any, exhibit: Exhibit, several: int) -> str:
+    """A setting in a legend: its value, and its name where that does not speak for itself."""
+    return named(value) if isinstance(value, str) or several == 0 else f"{exhibit.label(key)} {named(value)}"
+
+
+def _settings(axes: Axes, lines: Lines, metric: str, exhibit: Exhibit) -> None:
+    assert exhibit.x is not None, "lines and bars have one"
+    places = _places(lines, exhibit)
+    numeric = exhibit.kind == "line" and all(isinstance(place, float) for place in places.values())
+    width = 0.8 / len(lines)
+    for i, (label, cells) in enumerate(lines.items()):
+        held = [(places[named(cell.values.get(exhibit.x))], cell) for cell in cells if cell.all(metric)]
+        x, y = [place for place, _ in held], [fmean(cell.all(metric)) for _, cell in held]
+        color = COLORS[i % len(COLORS)]
+        if exhibit.kind == "line":
+            axes.plot(x, y, "o-", color=color, linewidth=2, markersize=5, label=label)
+        else:
+            x = [place + (i - (len(lines) - 1) / 2) * width for place in x]
+            axes.bar(x, y, 0.9 * width, color=color, label=label)
+        seeds = [(place, value) for place, (_, cell) in zip(x, held, strict=True) for value in cell.all(metric)]
+        if len(seeds) > len(held):
+            axes.plot(*zip(*seeds, strict=True), ".", color="#333333", markersize=5, alpha=0.6, linestyle="none")
+    _baselines(axes, lines, metric, exhibit, places)
+    if numeric and "x" not in exhibit.log:
+        axes.set_xticks(_thinned(sorted(places.values())))
+    elif not numeric:
+        tilt = {"rotation": 20, "ha": "right"} if max(map(len, places)) > 10 else {}
+        axes.set_xticks(list(places.values()), list(places), **tilt)
+        axes.xaxis.set_minor_locator(NullLocator())
+    axes.set_xlabel(exhibit.label(exhibit.x))
+
+
+def _places(lines: Lines, exhibit: Exhibit) -> dict[str, float | int]:
+    """Where on the axis each value lies, by its name: numbers where they are, in a line, others in their order."""
+    values = {
+        named(cell.values.get(exhibit.x)): _plain(cell.values.get(exhibit.x)) for c in lines.values() for cell in c
+    }  # type: ignore[arg-type]
+    if exhibit.kind == "line" and all(isinstance(v, int | float) and not isinstance(v, bool) for v in values.values()):
+        return {name: float(value) for name, value in values.items()}
+    return {name: i for i, name in enumerate(values)}
+
+
+def _plain(value: Any) -> Any:
+    """`[8.0]`, a list of one, is its number."""
+    return value[0] if isinstance(value, list) and len(value) == 1 else value
+
+
+def _thinned(ticks: list[float]) -> list[float]:
+    """Without those so near the next that their numbers would touch."""
+    kept: list[float] = []
+    gap = 0.06 * (ticks[-1] - ticks[0])
+    for tick in reversed(ticks):
+        if not kept or kept[-1] - tick >= gap:
+            kept.append(tick)
+    return kept
+
+
+def _curves(axes: Axes, lines: Lines, name: str, exhibit: Exhibit) -> None:
+    for i, (label, cells) in enumerate(lines.items()):
+        curve = cells[0].curve(name)
+        axes.plot(list(curve), list(curve.values()), "o-", color=COLORS[i % len(COLORS)], markersize=3, label=label)
+    for baseline in exhibit.beside:
+        curve = next(iter(lines.values()))[0].curve(name.replace("test/", f"baseline/{baseline}/"))
+        color, dash = BASELINES.get(baseline, ("#8c8c8c", "--"))
+        axes.plot(list(curve), list(curve.values()), color=color, linestyle=dash, label=baseline)
+    axes.set_xlabel(exhibit.label("x"))
+
+
+def _baselines(axes: Axes, lines: Lines, metric: str, exhibit: Exhibit, places: Mapping[str, float | int]) -> None:
+    """What stands beside the model at each place, as a dashed line."""
+    for baseline in exhibit.beside:
+        name = metric.replace("test/", f"baseline/{baseline}/")
+        at: dict[float, list[float]] = {}
+        for cell in (cell for cells in lines.values() for cell in cells):
+            at.setdefault(places[named(cell.values.get(exhibit.x))], []).extend(cell.all(name))  # type: ignore[arg-type]
+        drawn = {place: fmean(values) for place, values in sorted(at.items()) if values}
+        if drawn and name != metric:
+            color, dash = BASELINES.get(baseline, ("#8c8c8c", "--"))
+            axes.plot(list(drawn), list(drawn.values()), color=color, linestyle=dash, linewidth=1.6, label=baseline)
+
+
+@matplotlib.rc_context(STYLE)
+def draw_keypoints(frames: Mapping[str, FrameKeypoints], title: str) -> Figure:
+    """A frame of each scene, with its 10, 50, 100 and 300 strongest features as red dots (thesis, fig. 2.2).
+
+    Args:
+        frames: by the scene's name.
+        title: the heading.
+    """
+    figure = Figure(figsize=(3 * len(STRONGEST), 2.5 * len(frames) + 0.5), dpi=120, layout="constrained")
+    figure.suptitle(title, x=0.015, ha="left", fontsize=12, fontweight="bold")
+    panels = figure.subplots(len(frames), len(STRONGEST), squeeze=False)
+    for row, (scene, frame) in zip(panels, frames.items(), strict=True):
+        image = read_rgb(frame.image)
+        for axes, count in zip(row, STRONGEST, strict=True):
+            axes.imshow(image)
+            axes.plot(*frame.keypoints[:count, :2].T, ".", color="#e8000b", markersize=4, linestyle="none")
+            axes.set(xticks=[], yticks=[], xlim=(0, image.shape[1]), ylim=(image.shape[0], 0))
+            axes.set_title(f"{count} features" if row is panels[0] else "", fontsize=10)
+        row[0].set_ylabel(scene)
+    return figure

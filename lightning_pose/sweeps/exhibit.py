@@ -1,0 +1,139 @@
+"""What a study ends in beside its best trial: one figure and one table of all that it measured."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from lightning_pose.errors import ConfigError
+from lightning_pose.sweeps.space import Parameter, nearest
+
+__all__ = ["BASE", "MEASURES", "SEED", "Exhibit", "parse_exhibit"]
+
+BASE, SEED = "base", "seed_everything"
+"""Parameters with a part of their own: which base config a trial has, and what is averaged over."""
+
+MEASURES = {
+    None: ("val/", "cost/"),
+    "test": ("val/", "test/", "cost/", "baseline/", "train/"),
+    "features": ("features/",),
+}
+"""What trials measure, and the metrics that they have then."""
+
+KINDS = ("line", "bar", "curve", "pictures")
+FIELDS = ("x", "y", "kind", "log", "beside", "title", "table", "labels")
+ERRORS = ("position_median_m", "orientation_median_deg")
+
+
+@dataclass(frozen=True)
+class Exhibit:
+    """A figure and a table.
+
+    Attributes:
+        kind: `line` or `bar` over a setting; `curve` over whatever a trial's own curves run over, one line a trial;
+            `pictures` of keypoints.
+        x: the setting along the horizontal axis; None for curves and pictures.
+        y: metrics, or curves, one panel each.
+        log: which axes are logarithmic.
+        beside: baselines that are drawn with the model, by name.
+        title: the heading; the study's name if not given.
+        table: columns of the table beside the settings.
+        labels: what axes and columns are called, by setting or metric.
+    """
+
+    kind: str
+    x: str | None
+    y: tuple[str, ...]
+    log: tuple[str, ...]
+    beside: tuple[str, ...]
+    title: str | None
+    table: tuple[str, ...]
+    labels: Mapping[str, str]
+
+    def label(self, name: str) -> str:
+        """What a setting or a metric is called where it is shown."""
+        return self.labels.get(name) or _spelt(name)
+
+
+def parse_exhibit(raw: Any, measure: str | None, space: Sequence[Parameter]) -> Exhibit | None:
+    """Read the `figure` of a sweep file; None where there is none.
+
+    Raises:
+        ConfigError: an entry is malformed; the message names it.
+    """
+    if raw is None:
+        return None
+    if not isinstance(raw, Mapping):
+        raise ConfigError(f"figure is {raw!r}; give {{x: model.layers, y: [test/position_median_m]}}")
+    for field in raw:
+        if field not in FIELDS:
+            raise ConfigError(f"figure has no entry {field!r}; {nearest(str(field), FIELDS)}")
+    kind = raw.get("kind", "line")
+    if kind not in KINDS:
+        raise ConfigError(f"figure.kind is {kind!r}; {nearest(str(kind), KINDS)}")
+    y = _names(raw.get("y", []), "y")
+    if not y and kind != "pictures":
+        y = tuple(f"{'test' if measure == 'test' else 'val'}/{name}" for name in ERRORS)
+    table = _names(raw.get("table", []), "table")
+    for metric in (*y, *table):
+        if not metric.startswith(MEASURES[measure]):
+            raise ConfigError(
+                f"figure shows {metric}, but trials with `measure: {measure or 'null'}` have "
+                f"{', '.join(MEASURES[measure])} metrics; name one of these, or set measure"
+            )
+    log = _names(raw.get("log", []), "log")
+    if not set(log) <= {"x", "y"}:
+        raise ConfigError(f"figure.log is {list(log)}; give [x], [y] or [x, y]")
+    return Exhibit(
+        kind=kind,
+        x=_axis(raw.get("x"), kind, space),
+        y=y,
+        log=log,
+        beside=_names(raw.get("beside", []), "beside"),
+        title=raw.get("title"),
+        table=table or (() if kind in ("curve", "pictures") else y),
+        labels={str(name): str(label) for name, label in (raw.get("labels") or {}).items()},
+    )
+
+
+def _axis(x: Any, kind: str, space: Sequence[Parameter]) -> str | None:
+    keys = [parameter.key for parameter in space]
+    if kind in ("curve", "pictures"):
+        if x is not None:
+            raise ConfigError(
+                f"figure.x is {x}, but a figure of kind {kind} has no setting along its axis; leave it out"
+            )
+        return None
+    name = str(x).replace(".init_args.", ".")
+    if name not in keys:
+        raise ConfigError(f"figure.x is {x}, which is not searched; {nearest(name, keys)}")
+    return name
+
+
+def _names(value: Any, field: str) -> tuple[str, ...]:
+    names = [value] if isinstance(value, str) else value
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise ConfigError(f"figure.{field} is {value!r}; give a list of names")
+    return tuple(names)
+
+
+SPELT = {
+    "position_median_m": "median position error (m)",
+    "orientation_median_deg": "median orientation error (°)",
+    "train_seconds": "training time (s)",
+    "parameters": "parameters",
+    "layers": "layers",
+    "ms_per_frame": "network, ms a frame",
+    "features_ms_per_frame": "features, ms a frame",
+    "frame_bytes": "bytes of a frame's features",
+    "checkpoint_bytes": "bytes of the weights' file",
+    "class_path": "features",
+    "root": "scene",
+    BASE: "system",
+}
+
+
+def _spelt(name: str) -> str:
+    last = name.rpartition("/")[2] if "/" in name else name.rpartition(".")[2]
+    return SPELT.get(last, last.replace("_", " "))
