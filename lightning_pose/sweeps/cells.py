@@ -99,9 +99,9 @@ def named(value: Any) -> str:
         return f"{value:g}"
     if isinstance(value, list) and len(value) == 1:
         return named(value[0])
-    return (
-        {None: "none", True: "yes", False: "no"}.get(value, str(value)) if not isinstance(value, list) else str(value)
-    )
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return "none" if value is None else str(value)
 
 
 def varying(cells: Iterable[Cell]) -> list[str]:

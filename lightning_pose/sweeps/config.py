@@ -62,12 +62,15 @@ def resolve(base: Path, settings: Mapping[str, Any]) -> tuple[ParsedConfig, dict
     """
     cli = ParsedConfig(["--config", str(base)])
     known = keys(cli.config.as_dict())
-    for key in settings:
-        check_known(key, known, "")
     named = {
         f"{key}.class_path" if isinstance(value, str) and f"{key}.class_path" in known else key: value
         for key, value in settings.items()
     }
+    classes = {key: value for key, value in named.items() if key.endswith(".class_path")}
+    if classes:  # which have settings of their own
+        known |= keys(cli.parse(["--config", str(base), *options(classes)]))
+    for key in settings:
+        check_known(key, known, "")
     return cli, named, cli.parse(["--config", str(base), *options(named)])
 
 

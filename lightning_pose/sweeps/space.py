@@ -60,7 +60,8 @@ class Parameter:
             return self.choices[trial.suggest_categorical(self.key, list(self.choices))]
         if self.kind == "int":
             return trial.suggest_int(self.key, int(self.low), int(self.high), step=int(self.step or 1), log=self.log)
-        return trial.suggest_float(self.key, self.low, self.high, step=self.step, log=self.log)
+        drawn = trial.suggest_float(self.key, self.low, self.high, step=self.step, log=self.log)
+        return drawn if self.step is None else float(f"{drawn:.12g}")  # three steps of 0.1 are 0.3 to a reader
 
     def grid_labels(self) -> list[Scalar]:
         """Every value, as Optuna stores it.
