@@ -110,6 +110,7 @@ def _quieten() -> None:
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", message=".*LeafSpec.*")  # Lightning's own use of torch
+    warnings.filterwarnings("ignore", message=".*torch.jit.script.* is deprecated")  # PyG's
     warnings.filterwarnings("ignore", message=".*dirpath has changed|Checkpoint directory .* exists")  # resumed runs
 
 

@@ -34,6 +34,8 @@ HELP = """Search the settings of a config for what is best on its validation fra
   train and test the best      fit --config mlruns/sweeps/STUDY/best.yaml
   look at it as it goes        optuna-dashboard sqlite:///mlruns/optuna.db
                                mlflow ui --backend-store-uri sqlite:///mlruns/mlflow.db
+  a figure of the thesis       sweep sweeps/thesis/figure_4_5.yaml --data.root DIR
+  less of it                   ... --space.model.neighbours "[1, 10, 40]" --trainer.max_epochs 20
 
 The same command goes on with the study, after Ctrl-C as after the last trial. A trial whose process dies is
 run again. Trials are runs nested in the study's, and keep no checkpoints."""
@@ -50,7 +52,21 @@ FILE_HELP = """a sweep file:
     model.units: {type: int, low: 50, high: 300, step: 50}
     model.learning_rate: {type: float, low: 1.0e-4, high: 1.0e-2, log: true}
     model.schedule: [constant, cosine]
-    model.weight_decay: {type: float, low: 0, high: 0.1, when: {model.schedule: cosine}}"""
+    model.weight_decay: {type: float, low: 0, high: 0.1, when: {model.schedule: cosine}}
+
+a study, such as those of sweeps/thesis, is a sweep that ends in a figure and a table of all its trials:
+
+  base: [../configs/node_pose.yaml, ../configs/graph_pose.yaml]   # `when: {base: node_pose}` is for one of them
+  sampler: grid                       # every combination; test frames choose nothing
+  measure: test                       # test frames too; or features, without training
+  space: {model.neighbours: [1, 10, 40], seed_everything: [0, 1, 2]}   # seeds are averaged
+  figure:
+    x: model.neighbours
+    y: [test/position_median_m]       # one panel each
+    kind: line                        # bar, curve (a trial's own, by clip length), pictures (of keypoints)
+    log: [x]
+    beside: [retrieval_top1]          # baselines
+    table: [test/position_median_m, cost/train_seconds]"""
 
 
 def main(argv: list[str]) -> int:

@@ -67,6 +67,7 @@ class MLflowLogger(MLFlowLogger):
         # alembic and mlflow announce each table of a new database on the terminal.
         for noisy in ("alembic", "mlflow.store.db.utils", "mlflow.tracking.fluent"):
             logging.getLogger(noisy).setLevel(logging.WARNING)
+        logging.getLogger("lightning.pytorch.loggers.mlflow").setLevel(logging.ERROR)  # a first experiment is no news
         uri = tracking_uri or default_tracking_uri(root)
         local = uri.startswith("sqlite:///")
         if local:

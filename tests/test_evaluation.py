@@ -10,7 +10,10 @@ import torch
 
 from lightning_pose.data.formats import load_scene
 from lightning_pose.evaluation import print_results
+from lightning_pose.evaluation.base import count_layers
 from lightning_pose.geometry import orientation_error_deg, position_error_m
+from lightning_pose.models import DensePoseNet, LinearPoseNet, NodePose, SurfCNN, SurfLSTM
+from lightning_pose.models.base import PoseModule
 from lightning_pose.summary import summarize_errors
 from tests.helpers import Trained, Workplace
 
@@ -102,3 +105,18 @@ def test_retrieval_searches_what_the_model_has_learnt_from(workplace: Workplace,
     for refit, known in (("false", places["train"]), ("true", np.concatenate([places["train"], places["val"]]))):
         nearest = np.linalg.norm(places["test"][:, None] - known, axis=2).min(1)
         assert oracles[refit] == pytest.approx(nearest.mean(), abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("model", "layers"),
+    [
+        (SurfCNN(input_shape=[20, 64], channels=[4, 4, 4, 4, 4], units=8), 7),  # as table 2.2 counts
+        (SurfLSTM(input_shape=[20, 64], units=8), 3),  # two recurrent ones and the output
+        (DensePoseNet(input_shape=[32]), 4),
+        (LinearPoseNet(input_shape=[32]), 1),
+        (NodePose(input_shape=[32], channels=[8, 8, 8]), 5),  # three convolutions, position and orientation
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_layers_are_counted_as_the_thesis_does(model: PoseModule, layers: int) -> None:
+    assert count_layers(model.network) == layers  # type: ignore[arg-type]
