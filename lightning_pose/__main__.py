@@ -19,7 +19,7 @@ VERBS = {
     "sweep": ("lightning_pose.sweep", "search a config's settings, on validation frames: parallel, resumable"),
     "report": (
         "lightning_pose.report",
-        "tables of finished runs, systems by scenes, beside baselines and published rows",
+        "tables of finished runs: systems by scenes, beside baselines and published rows",
     ),
     "check": ("lightning_pose.check", "say what a dataset holds, and what is wrong with it"),
     "synth": ("lightning_pose.synth", "render a synthetic room as a dataset"),

@@ -1,1 +1,1 @@
-"""What `report` prints: `store` reads runs, `select` filters, `compare` refuses mixtures, `tables` joins, the rest show."""
+"""Reports: `store` reads runs, `select` filters them, `compare` refuses mixtures, `tables` joins them, others show."""

@@ -131,10 +131,10 @@ def _values(cells: dict[str, Cell]) -> dict[str, tuple[float, float | None]]:
 def _means(report: Report, columns: dict[str, str]) -> list[Row]:
     """Means over the seven scenes, which stand beside means over just these."""
     seven = set(list(SCENES.values())[:SEVEN])
-    if set(columns.values()) != seven or len(report.scenes) != SEVEN:
-        report.notes.append("published means over the seven scenes are left out: other scenes are on show")
-        return []
     if any(facts.get("task", "absolute") != "absolute" for facts in report.facts.values()):
+        return []
+    if set(columns.values()) != seven or len(report.scenes) != SEVEN:
+        report.notes.append("published means over the seven scenes are left out: other scenes, or fewer, are on show")
         return []
     rows = []
     for system, source, text in MEANS:
@@ -154,9 +154,7 @@ def _comparable(report: Report, columns: dict[str, str]) -> str:
         elif facts.get("test_frames", str(FRAMES[name])) != str(FRAMES[name]):
             cut.append(f"{scene} is a cut, {facts['test_frames']} test frames of {FRAMES[name]}")
         elif "test_frames" not in facts:
-            cut.append(
-                f"{scene} may be a cut, its runs do not tell how many of the {FRAMES[name]} test frames they have"
-            )
+            cut.append(f"{scene} may be a cut, no run tells how many of the {FRAMES[name]} test frames it has")
     if not cut:
         return "published rows are of the same official test frames; image sizes and training may differ"
     return f"published rows are of the whole official test split and do not compare: {'; '.join(cut)}"

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 __all__ = ["Shown", "as_latex", "as_markdown", "print_table"]
 
 MARK = "†"
-ABSENT = "–"
+ABSENT = "–"  # noqa: RUF001
 SIZES = ((1e9, "GB"), (1e6, "MB"), (1e3, "kB"))
 MEAN = "mean of scenes"
 
@@ -66,7 +66,7 @@ def print_table(report: Report, shown: Shown, file: TextIO | None = None) -> Non
     from rich.console import Console
     from rich.table import Table
 
-    file = file or sys.stdout
+    stream: TextIO = sys.stdout if file is None else file
     headings, lines = _grid(report, shown)
     table = Table(show_lines=False, title_justify="left")
     for i, heading in enumerate(headings):
@@ -75,7 +75,7 @@ def print_table(report: Report, shown: Shown, file: TextIO | None = None) -> Non
         ends = i + 1 < len(lines) and report.rows[i + 1].kind != row.kind
         style = None if row.kind == "own" else "dim"
         table.add_row(*map(_rich, line), style=style, end_section=ends)
-    console = Console(file=file, width=None if file.isatty() else 1000, highlight=False)
+    console = Console(file=stream, width=None if stream.isatty() else 1000, highlight=False)
     console.print(table)
     for note in _said(report):
         console.print(note, markup=False, soft_wrap=True)
@@ -84,7 +84,7 @@ def print_table(report: Report, shown: Shown, file: TextIO | None = None) -> Non
 def as_markdown(report: Report, shown: Shown) -> str:
     """A table in Markdown, and below it a list of what must be said."""
     headings, lines = _grid(report, shown)
-    escape: Callable[[str], str] = lambda text: re.sub(r"([|*_`<\\])", r"\\\1", text)  # noqa: E731
+    escape: Callable[[str], str] = lambda text: re.sub(r"([|*<\\])", r"\\\1", text)  # noqa: E731
     rows = [[_joined(cell, escape, "**{}**") for cell in line] for line in lines]
     aligned = ["---" if i < 2 else "---:" for i in range(len(headings))]
     table = [f"| {' | '.join(row)} |" for row in ([escape(h) for h in headings], aligned, *rows)]

@@ -23,7 +23,7 @@ class Filters:
         experiment: name of the MLflow experiment.
         systems: architectures.
         scenes: names of scenes.
-        tags: (name, value) of tags or settings.
+        tags: (name, value) of tags or settings; values of one name are alternatives.
         since: when they started, at the earliest.
         until: when they started, before this.
         trials: runs of sweeps as well.
@@ -56,9 +56,10 @@ def select_runs(runs: Sequence[Run], filters: Filters) -> tuple[list[Run], list[
     )
     kept = _keep_values(kept, "--system", filters.systems, lambda run: run.system)
     kept = _keep_values(kept, "--scene", filters.scenes, lambda run: run.scene)
-    for name, value in filters.tags:
+    for name in dict.fromkeys(name for name, _ in filters.tags):
         check_setting(name, kept)
-        kept = _keep_values(kept, f"--tag {name}", [value], lambda run, name=name: setting(run, name))
+        wanted = [value for other, value in filters.tags if other == name]
+        kept = _keep_values(kept, f"--tag {name}=", wanted, lambda run, name=name: setting(run, name))
     kept = _keep_dates(kept, filters)
     tested = [run for run in kept if "test/position_median_m" in run.metrics]
     missing = len(kept) - len(tested)
@@ -119,7 +120,8 @@ def _keep_values(runs: list[Run], option: str, wanted: Sequence[str], value: Cal
     for want in wanted:
         if want not in there:
             more = f" and {len(there) - MOST} more" if len(there) > MOST else ""
-            raise ConfigError(f"{option} {want} matches no run; there is {', '.join(there[:MOST]) or 'none'}{more}")
+            said = option + want if option.endswith("=") else f"{option} {want}"
+            raise ConfigError(f"{said} matches no run; there is {', '.join(there[:MOST]) or 'none'}{more}")
     return [run for run in runs if values[run.run_id] in wanted]
 
 

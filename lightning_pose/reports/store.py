@@ -1,4 +1,4 @@
-"""Runs as an MLflow store keeps them, read from its own tables: MLflow takes seconds to import, and a report does without.
+"""Runs as an MLflow store keeps them, read from its own tables, because MLflow takes seconds to import.
 
 A database gives a thousand runs in a quarter of a second; a tracking server is asked through MLflow's client.
 """
@@ -47,7 +47,7 @@ _VALUES = "SELECT t.run_uuid, t.key, t.value " + _MINE.format(join="JOIN {table}
 _METRICS = (
     "SELECT t.run_uuid, t.key, t.value, t.is_nan "
     + _MINE.format(join="JOIN latest_metrics t ON t.run_uuid = r.run_uuid")
-    + """ AND (t.key LIKE 'test/%' OR t.key LIKE 'val/%' OR t.key LIKE 'cost/%' OR t.key LIKE 'baseline/%/%_median_%')"""
+    + " AND (t.key LIKE 'test/%' OR t.key LIKE 'val/%' OR t.key LIKE 'cost/%' OR t.key LIKE 'baseline/%_median_%')"
 )
 _STATES = """SELECT v.value, r.status, r.lifecycle_stage FROM runs r
 LEFT JOIN tags v ON v.run_uuid = r.run_uuid AND v.key = 'verb'"""
@@ -136,9 +136,7 @@ def read_runs(uri: str) -> list[Run]:
             "database's URL, or the http address of an MLflow server"
         )
     if not runs:
-        raise ConfigError(
-            f"{masked(uri)} has no finished run of fit or test; train with `python -m lightning_pose fit`"
-        )
+        raise ConfigError(f"{uri} has no finished run of fit or test; train with `python -m lightning_pose fit`")
     return sorted(runs, key=lambda run: (run.started, run.run_id), reverse=True)
 
 

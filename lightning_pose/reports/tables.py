@@ -24,6 +24,8 @@ SKILLS = ("skill_position", "skill_orientation")
 BY_SCENE = ("data.root", "data.format", "data.room_seed", "data.train_scenes", "data.test_scenes", "data.train_rooms",
             "data.test_rooms")  # fmt: skip
 
+UNTOLD = "not told"
+
 Kind = Literal["own", "baseline", "published"]
 
 
@@ -132,7 +134,7 @@ def build_report(runs: Sequence[Run], pick: Pick = "best", by: Sequence[str] = (
         check_setting(name, runs)
     groups: dict[tuple[str, ...], dict[str, list[Run]]] = {}
     for run in runs:
-        key = (run.system, *(setting(run, name) or "not told" for name in by))
+        key = (run.system, *(setting(run, name) or UNTOLD for name in by))
         groups.setdefault(key, {}).setdefault(run.scene, []).append(run)
     missing = missing_facts(runs)
     notes = [missing] if missing else []
@@ -172,8 +174,8 @@ def _mean(cells: Sequence[Cell]) -> Mean:
 
 def _row(key: tuple[str, ...], by: Sequence[str], groups: Mapping[str, list[Run]], pick: Pick, choice: Choice) -> Row:
     settings = dict(zip(by, key[1:], strict=True))
-    told = ", ".join(f"{name.rpartition('.')[2]}={value}" for name, value in settings.items())
-    label = key[0] + (f" ({told})" if by else "")
+    told = ", ".join(f"{name.rpartition('.')[2]}={value}" for name, value in settings.items() if value != UNTOLD)
+    label = key[0] + (f" ({told})" if told else "")
     cells = {}
     for scene, runs in groups.items():
         chosen = pick_runs(runs, pick, f"{label} on {scene}", choice)
