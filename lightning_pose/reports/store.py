@@ -147,7 +147,7 @@ def masked(uri: str) -> str:
 
 @contextmanager
 def _open(uri: str) -> Iterator[Query]:
-    """A function that runs one SQL query, all on one state of the database."""
+    """A function that runs one SQL query."""
     if uri.startswith("sqlite:"):
         with _open_sqlite(uri) as query:
             yield query
@@ -158,7 +158,7 @@ def _open(uri: str) -> Iterator[Query]:
 
     try:
         engine = create_engine(_with_driver(uri))
-        with engine.connect().execution_options(isolation_level="REPEATABLE READ") as connection:
+        with engine.connect() as connection:
             yield lambda sql: connection.execute(text(sql)).fetchall()
     except (SQLAlchemyError, ImportError) as error:
         reason = " ".join(str(getattr(error, "orig", None) or error).split())
@@ -204,6 +204,7 @@ def _check_tables(query: Query, uri: str) -> None:
 
 
 def _from_tables(query: Query) -> list[Run]:
+    runs = list(query(_RUNS))  # before their values: what ends in between is not half read
     values: dict[str, dict[str, dict[str, Any]]] = {}
     for table in ("tags", "params"):
         found = values.setdefault(table, {})
@@ -215,7 +216,7 @@ def _from_tables(query: Query) -> list[Run]:
             metrics.setdefault(run, {})[name] = math.nan if is_nan else _finite(value)
     return [
         Run(run, name or "", experiment, started or 0, *(values[part].get(run, {}) for part in values))
-        for run, name, experiment, started in query(_RUNS)
+        for run, name, experiment, started in runs
     ]
 
 
