@@ -61,7 +61,9 @@ def test_old_runs_tell_their_task_by_their_settings(tmp_path: Path, store: Path)
     image, clip = read_runs(make_store(tmp_path / "mlflow.db", store, runs))
     assert image.settings["task"] == "absolute"
     assert "clip_length" not in image.settings
-    told = {name: clip.settings[name] for name in ("task", "clip_length", "stride", "relative_frame", "seed_everything")}
+    told = {
+        name: clip.settings[name] for name in ("task", "clip_length", "stride", "relative_frame", "seed_everything")
+    }
     assert told == {
         "task": "relative", "clip_length": "10", "stride": "2", "relative_frame": "world", "seed_everything": "4",
     }  # fmt: skip
@@ -100,7 +102,9 @@ def test_nothing_finished_says_what_there_is(tmp_path: Path, store: Path) -> Non
 
 def test_an_unreachable_database_keeps_its_password() -> None:
     uri = "postgresql+psycopg://ada:secret@127.0.0.1:1/mlflow"
-    with pytest.raises(ConfigError, match=r"postgresql\+psycopg://ada:\*\*\*@127.0.0.1:1/mlflow cannot be read") as info:
+    with pytest.raises(
+        ConfigError, match=r"postgresql\+psycopg://ada:\*\*\*@127.0.0.1:1/mlflow cannot be read"
+    ) as info:
         read_runs(uri)
     assert "secret" not in str(info.value)
     assert masked("sqlite:///a.db") == "sqlite:///a.db"

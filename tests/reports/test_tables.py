@@ -98,7 +98,9 @@ def test_spread_takes_the_newest_of_each_seed_and_no_test_runs(table) -> None:
 
 def test_spread_refuses_runs_that_differ_in_more_than_the_seed(table) -> None:
     runs = [FakeRun(params={"seed": str(n), "model.units": str(n)}) for n in (1, 2)]
-    with pytest.raises(ConfigError, match=r"2 runs differ in model.units \(1, 2\), .* give --by model.units .* or --tag"):
+    with pytest.raises(
+        ConfigError, match=r"2 runs differ in model.units \(1, 2\), .* give --by model.units .* or --tag"
+    ):
         table(*runs, pick="spread")
     assert list(shown(table(*runs, pick="spread", by=("model.units",)))) == ["SurfLSTM (units=1)", "SurfLSTM (units=2)"]
     with pytest.raises(ConfigError, match="1 runs of `test`, which do not know the seed"):
