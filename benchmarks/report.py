@@ -2,8 +2,8 @@
 
     python benchmarks/report.py [--runs 1000] [--epochs 20] [--rounds 5]
 
-Both are processes of their own, from start to end, as a user waits for them; rounds alternate. The runs have 60 settings,
-60 metrics with a history over epochs, and tags. The goal is under 3 seconds.
+Both are processes of their own, from start to end, as a user waits for them; rounds alternate. The runs have 60
+settings, 60 metrics with a history over epochs, and tags. The goal is under 3 seconds.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ PEER = """
 import sys
 import mlflow
 mlflow.set_tracking_uri(sys.argv[1])
-runs = mlflow.search_runs(search_all_experiments=True, filter_string="attributes.status = 'FINISHED'", max_results=50000)
+finished = "attributes.status = 'FINISHED'"
+runs = mlflow.search_runs(search_all_experiments=True, filter_string=finished, max_results=50000)
 best = runs.sort_values("metrics.val/position_median_m").drop_duplicates(["tags.architecture", "tags.scene"])
 errors = ["metrics.test/position_median_m", "metrics.test/orientation_median_deg"]
 table = best.pivot(index="tags.architecture", columns="tags.scene", values=errors)

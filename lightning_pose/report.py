@@ -175,8 +175,8 @@ def _parser() -> argparse.ArgumentParser:
         metavar="NAME=VALUE",
         action="append",
         default=[],
-        help="only runs with this tag, or this setting, such as data.extractor.backbone=resnet50; repeatable, and values "
-        "of one name are alternatives",
+        help="only runs with this tag, or this setting, such as data.extractor.backbone=resnet50 (repeatable; values of "
+        "one name are alternatives)",
     )
     add("--since", metavar="DATE", help="only runs that started then or later: 2026-03-01, 2026-03-01T18:00")
     add("--until", metavar="DATE", help="only runs that started before the end of that day, or that time")

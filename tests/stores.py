@@ -102,8 +102,8 @@ def _add(connection: sqlite3.Connection, run: FakeRun, run_id: str, epochs: int)
     stage = "deleted" if run.deleted else "active"
     name = f"{run.system} {run.scene}"
     connection.execute(
-        "INSERT INTO runs (run_uuid, name, status, start_time, lifecycle_stage, experiment_id, source_type, artifact_uri,"
-        " user_id) VALUES (?, ?, ?, ?, ?, ?, 'LOCAL', '', 'ada')",
+        "INSERT INTO runs (run_uuid, name, status, start_time, lifecycle_stage, experiment_id, source_type,"
+        " artifact_uri, user_id) VALUES (?, ?, ?, ?, ?, ?, 'LOCAL', '', 'ada')",
         [run_id, name, run.status, started, stage, *known],
     )
     for table, values in (("tags", run.all_tags), ("params", {**PARAMS, **run.params})):

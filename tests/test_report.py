@@ -52,7 +52,7 @@ def test_the_table(capsys: pytest.CaptureFixture[str]) -> None:
     out, err = printed(capsys, "--published", "--chapter", "2", "--baselines", "--costs", "--skill")
     rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in out.splitlines() if line.startswith("│")]
     table = {row[0]: row[1:] for row in rows}
-    assert table["NodePose"][:4] == ["cnn", "0.098 / 6.50", "–", "0.098 / 6.50 [1 of 2]"]  # noqa: RUF001
+    assert table["NodePose"][:4] == ["cnn", "0.098 / 6.50", "–", "0.098 / 6.50 [1 of 2]"]
     assert table["SurfLSTM"] == [
         "surf", "0.187 / 6.30", "0.251 / 8.00", "0.219 / 7.15", "1.61 / 0.96",
         "375,807", "84.2", "0.5", "9.5", "12.8 kB", "1.5 MB",
@@ -72,10 +72,10 @@ def test_markdown(capsys: pytest.CaptureFixture[str]) -> None:
     assert lines[:4] == [
         "| system | features | redkitchen | my_room | mean of scenes |",
         "| --- | --- | ---: | ---: | ---: |",
-        "| NodePose | cnn | **0.098** / 6.50 | – | 0.098 / 6.50 [1 of 2] |",  # noqa: RUF001
+        "| NodePose | cnn | **0.098** / 6.50 | – | 0.098 / 6.50 [1 of 2] |",
         "| SurfLSTM | surf | 0.187 / **6.30** | 0.251 / 8.00 | 0.219 / 7.15 |",
     ]
-    assert "| SurfCNN † | table 3.2 | 0.37 / 10.25 | – | 0.370 / 10.25 [1 of 2] |" in lines  # noqa: RUF001
+    assert "| SurfCNN † | table 3.2 | 0.37 / 10.25 | – | 0.370 / 10.25 [1 of 2] |" in lines
     assert any(line.startswith("- † published, not measured here") for line in lines)
     assert err == ""
 

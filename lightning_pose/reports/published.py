@@ -87,7 +87,7 @@ def add_published(report: Report, chapters: Sequence[int] = ()) -> None:
     report.rows += rows + means
     report.notes += [f"published rows of {task} poses are left out: those on show are not" for task in sorted(left_out)]
     report.notes += [_comparable(report, columns)] if rows or means else ["no published row has the task on show"]
-    report.footnotes += _footnotes(sorted(tables), bool(means))
+    report.footnotes += _footnotes(sorted(tables), bool(means), set(columns.values()))
 
 
 def _parse(line: str, table: str, scenes: Sequence[str]) -> Published:
@@ -160,14 +160,14 @@ def _comparable(report: Report, columns: dict[str, str]) -> str:
     return f"published rows are of the whole official test split and do not compare: {'; '.join(cut)}"
 
 
-def _footnotes(tables: Sequence[str], means: bool) -> list[str]:
+def _footnotes(tables: Sequence[str], means: bool, scenes: set[str]) -> list[str]:
     notes = []
     if tables:
         notes.append(
             f"{SOURCE}, table{'s' if len(tables) > 1 else ''} {', '.join(tables)}: cells as printed, means recomputed "
             "from them, so that the tables' own averages may differ; the chapters disagree with each other in places"
         )
-        notes += [REMARKS[table] for table in tables if table in REMARKS]
+        notes += [remark for about, remark in REMARKS.items() if about in (*tables, *scenes)]
     if means:
         notes.append("published means over the seven scenes, original ground truth, as their authors give them")
     if notes:

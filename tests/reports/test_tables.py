@@ -16,7 +16,7 @@ from tests.stores import FakeRun, make_store
 
 
 @pytest.fixture
-def table(tmp_path: Path, store: Path):  # noqa: ANN201
+def table(tmp_path: Path, store: Path):
     def make(*runs: FakeRun, pick: Pick = "best", by: tuple[str, ...] = ()) -> Report:
         return build_report(read_runs(make_store(tmp_path / "mlflow.db", store, runs)), pick, by)
 
@@ -98,9 +98,7 @@ def test_spread_takes_the_newest_of_each_seed_and_no_test_runs(table) -> None:
 
 def test_spread_refuses_runs_that_differ_in_more_than_the_seed(table) -> None:
     runs = [FakeRun(params={"seed": str(n), "model.units": str(n)}) for n in (1, 2)]
-    with pytest.raises(
-        ConfigError, match=r"2 runs differ in model.units \(1, 2\), .* give --by model.units .* or --tag"
-    ):
+    with pytest.raises(ConfigError, match=r"2 runs differ in model.units \(1, 2\), .* give --by model.units "):
         table(*runs, pick="spread")
     assert list(shown(table(*runs, pick="spread", by=("model.units",)))) == ["SurfLSTM (units=1)", "SurfLSTM (units=2)"]
     with pytest.raises(ConfigError, match="1 runs of `test`, which do not know the seed"):
@@ -147,7 +145,7 @@ def test_a_column_mixes_nothing(table, fact: str, other: str) -> None:
 
 def test_clips_of_another_length_do_not_mix(table) -> None:
     clips = [FakeRun("CNN3D", tags={"task": "relative", "clip_length": n}) for n in ("10", "100")]
-    with pytest.raises(ConfigError, match="differ in clip_length .* grow with the clip"):
+    with pytest.raises(ConfigError, match=r"differ in clip_length .* grow with the clip"):
         table(*clips)
 
 
