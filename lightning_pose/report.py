@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import NoReturn
 
 from lightning_pose.errors import ConfigError
+from lightning_pose.reports.pick import PICKS
 
 __all__ = ["main"]
 
 FORMATS = {"table": ".txt", "markdown": ".md", "latex": ".tex", "csv": ".csv", "json": ".json"}
-PICKS = ("best", "latest", "spread")
 
 HELP = """A table of systems (rows) by scenes (columns), median position error in metres / median orientation error in
 degrees on the test frames, and the mean over the scenes, out of the runs that `fit` and `test` have left in MLflow.
@@ -73,6 +73,7 @@ def main(argv: list[str]) -> int:
         trials=args.trials,
     )
     form = args.format or _form_of(args.out)
+    # As `tracking.default_tracking_uri` says, which Lightning comes with.
     uri = args.tracking_uri or os.environ.get("MLFLOW_TRACKING_URI") or "sqlite:///mlruns/mlflow.db"
     runs, notes = select_runs(read_runs(uri), filters)
     report = build_report(runs, args.pick, tuple(dict.fromkeys(args.by)))
@@ -175,8 +176,8 @@ def _parser() -> argparse.ArgumentParser:
         metavar="NAME=VALUE",
         action="append",
         default=[],
-        help="only runs with this tag, or this setting, such as data.extractor.backbone=resnet50 (repeatable; values of "
-        "one name are alternatives)",
+        help="only runs with this tag or setting, such as data.extractor.backbone=resnet50 (repeatable; values of one "
+        "name are alternatives)",
     )
     add("--since", metavar="DATE", help="only runs that started then or later: 2026-03-01, 2026-03-01T18:00")
     add("--until", metavar="DATE", help="only runs that started before the end of that day, or that time")

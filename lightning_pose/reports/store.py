@@ -6,6 +6,7 @@ A database gives a thousand runs in a quarter of a second; a tracking server is 
 from __future__ import annotations
 
 import math
+import os
 import re
 import sqlite3
 from collections import Counter
@@ -240,6 +241,8 @@ def _from_server(uri: str) -> list[Run]:
     from mlflow import MlflowClient
     from mlflow.exceptions import MlflowException
 
+    # MLflow's own seven retries keep the user waiting for minutes where no server is.
+    os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "2")
     try:
         return runs_of_client(MlflowClient(uri))
     except MlflowException as error:

@@ -137,8 +137,8 @@ REMARKS = {
     "3.2": "the rows PoseNet, Posenet-U, G-PoseNet, Pose-L and Mobile-PoseNet of table 3.2 likewise",
     "4.1": "table 4.1 gives G-PoseNet the cells that table 5.2 gives LSTM. PN",
     "shop": "table 4.1's shop cell of Node-Pose (ImageNet), 0.8/47, is taken for 0.8/4.7",
-    "mary": "in tables 4.1 and 5.2, below the thesis's own new systems, a row's cell of St Mary's is that of the shop in "
-    "the row above: as printed, but not to be relied on",
+    "mary": "in tables 4.1 and 5.2, most cells of St Mary's below the chapter's own systems repeat the shop's of the "
+    "row above: as printed, but not to be relied on",
     "6.1": "the clips of table 6.1 have 2 to 400 frames, of scenes that were not trained on",
 }
 """What a reader of a table must know, by table, or by scene of tables 4.1 and 5.2."""
