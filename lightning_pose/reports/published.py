@@ -169,9 +169,7 @@ def _footnotes(tables: Sequence[str], means: bool, scenes: set[str]) -> list[str
         )
         notes += [remark for about, remark in REMARKS.items() if about in (*tables, *scenes)]
     if means:
-        notes.append(
-            "means over the seven scenes, original ground truth, as quoted in the literature; their cells are not kept"
-        )
+        notes.append("means over the seven scenes, original ground truth, as the literature quotes them: no cells")
     if notes:
         notes.append(
             "all of these regress or retrieve poses; structure-based systems, such as ACE and hloc, are ten times "
