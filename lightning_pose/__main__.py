@@ -17,6 +17,10 @@ VERBS = {
     "predict": ("lightning_pose.cli", "write a checkpoint's poses of the test frames as TUM files"),
     "extract": ("lightning_pose.extract", "fill the feature cache: parallel, resumable"),
     "sweep": ("lightning_pose.sweep", "search a config's settings, on validation frames: parallel, resumable"),
+    "report": (
+        "lightning_pose.report",
+        "tables of finished runs: systems by scenes, beside baselines and published rows",
+    ),
     "check": ("lightning_pose.check", "say what a dataset holds, and what is wrong with it"),
     "synth": ("lightning_pose.synth", "render a synthetic room as a dataset"),
 }

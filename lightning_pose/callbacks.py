@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 from pathlib import Path
@@ -11,6 +12,8 @@ from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint, Timer
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
+from lightning_pose.errors import ImageError
+from lightning_pose.images import read_gray
 from lightning_pose.tracking import MLflowLogger
 
 __all__ = [
@@ -115,6 +118,7 @@ class RunRecorder(Callback):
             "ground_truth": scene.ground_truth,
             "unit": scene.unit,
             "features": datamodule.extractor.name,
+            **_test_tags(datamodule, module),
         }
         commit = _git_commit()
         return tags | ({"git_commit": commit} if commit else {})
@@ -144,6 +148,22 @@ def _settings(trainer: Trainer, module: LightningModule) -> dict[str, Any]:
         "trainer": {"max_epochs": trainer.max_epochs, "precision": trainer.precision},
         "seed": _seed(),
     }
+
+
+def _test_tags(datamodule: Any, module: LightningModule) -> dict[str, str]:
+    """What test errors are of: reports refuse to put errors of different things side by side."""
+    scene = datamodule.scene
+    test = scene.splits.get("test", ())
+    clips = getattr(module, "reads_clips", False)
+    tags = {"task": "relative" if clips else "absolute", "test_frames": str(len(test))}
+    if clips:
+        tags |= {name: str(getattr(datamodule, name)) for name in ("clip_length", "stride", "relative_frame")}
+    if len(test):
+        # Of one frame: those of a scene are alike. Cached features do without images, so one may be gone.
+        with contextlib.suppress(ImageError):
+            height, width = read_gray(scene.frames[test[0]].image).shape
+            tags["image_size"] = f"{width}x{height}"
+    return tags
 
 
 def _seed() -> int | None:

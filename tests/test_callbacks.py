@@ -33,10 +33,14 @@ def test_tags_and_parameters(trained: Trained) -> None:
         "ground_truth": "original",
         "unit": "m",
         "features": "thumbnails",
+        "task": "absolute",
+        "test_frames": "10",
+        "image_size": "64x48",
         "verb": "fit",
         "mlflow.runName": "SurfLSTM wall N=6",
     }
     assert expected.items() <= tags.items()
+    assert not {"clip_length", "stride", "relative_frame"} & tags.keys()
     assert params["model.units"] == "8"
     assert params["model.loss.form"] == "joint"
     assert params["data.extractor.class_path"] == "tests.helpers.Thumbnails"

@@ -35,6 +35,12 @@ def trajectory(run: Trained, name: str) -> np.ndarray:
     return np.loadtxt(client.download_artifacts(run_id, f"trajectories/{name}/seq-03.tum"))
 
 
+def test_tags_say_what_the_errors_are_relative_to(clip_run: Trained) -> None:
+    tags = clip_run.run.data.tags
+    expected = {"task": "relative", "clip_length": "4", "stride": "1", "relative_frame": "camera", "test_frames": "10"}
+    assert expected.items() <= tags.items()
+
+
 def test_errors_by_length_are_curves(clip_run: Trained) -> None:
     client, run_id = clip_run.workplace.client, clip_run.run.info.run_id
     for system in ("test", "baseline/no_motion", "baseline/visual_odometry", "baseline/constant_velocity"):

@@ -1,0 +1,163 @@
+"""Published rows: their figures, which of them are shown, and what keeps them from comparing."""
+
+from __future__ import annotations
+
+import statistics
+
+import pytest
+
+from lightning_pose.reports.published import add_published, published_systems
+from lightning_pose.reports.tables import Report
+from lightning_pose.reports.thesis import FRAMES, SCENES
+
+SEVEN = list(SCENES)[:7]
+
+
+def report_on(*scenes: str, **facts: str) -> Report:
+    """A table without rows of the user's own."""
+    told = {"task": "absolute", "dataset": "7scenes", "split": "official", "ground_truth": "original", "unit": "m"}
+    return Report(list(scenes), dict.fromkeys(scenes, told | facts), [], "", [])
+
+
+def cell(system: str, table: str, scene: str) -> tuple[float, float | None]:
+    (row,) = [row for row in published_systems() if (row.system, row.table) == (system, table)]
+    return row.cells[scene].position_m, row.cells[scene].orientation_deg
+
+
+def test_every_table_is_whole() -> None:
+    rows = published_systems()
+    counts = {table: sum(row.table == table for row in rows) for table in ("2.3", "3.2", "4.1", "5.2", "6.1")}
+    assert counts == {"2.3": 14, "3.2": 14, "4.1": 14, "5.2": 15, "6.1": 7}
+    for row in rows:
+        outdoors = row.table in ("4.1", "5.2") and len(row.cells) > 7
+        assert set(row.cells) == (set(FRAMES) if outdoors else set(list(FRAMES)[:7])), row.system
+        assert all(0.1 <= c.position_m <= 8 for c in row.cells.values())
+        assert all(c.orientation_deg is None or 1 <= c.orientation_deg <= 19 for c in row.cells.values())
+
+
+@pytest.mark.parametrize(
+    ("system", "table", "scene", "errors"),
+    [
+        ("SurfCNN 300", "2.3", "kitchen", (0.37, 10.25)),
+        ("SurfCNN 300", "2.3", "fire", (0.24, 8.2)),
+        ("SurfCNN", "3.2", "fire", (0.24, 12.8)),
+        ("SURF-CNN", "4.1", "stairs", (0.36, 10.8)),
+        ("SURF-LSTM 50", "3.2", "kitchen", (0.36, 7.6)),
+        ("Node-Pose (ImageNet)", "4.1", "shop", (0.8, 4.7)),
+        ("Dense-PoseNet (Places)", "5.2", "kings", (1.5, 2.9)),
+        ("VidLoc", "2.3", "kitchen", (0.31, None)),
+        ("3D CNN, clips", "6.1", "kitchen", (0.16, 6.5)),
+        ("2D CNN-RNN, clips", "6.1", "heads", (0.187, 7.26)),
+    ],
+)
+def test_cells(system: str, table: str, scene: str, errors: tuple[float, float | None]) -> None:
+    assert cell(system, table, scene) == errors
+
+
+@pytest.mark.parametrize("system", ["PoseNet", "G-PoseNet", "Mobile-PoseNet"])
+def test_the_literature_is_the_same_in_all_chapters(system: str) -> None:
+    for scene in list(FRAMES)[:7]:
+        assert cell(system, "2.3", scene) == cell(system, "3.2", scene) == cell(system, "5.2", scene)
+
+
+def test_some_printed_averages_are_the_means_of_their_cells() -> None:
+    """Where they are, a slip in copying a cell would show."""
+    printed = {
+        ("SurfCNN 300", "2.3"): (0.28, None), ("SURF-LSTM 100", "3.2"): (0.29, 9.53), ("PoseNet", "2.3"): (0.44, None),
+        ("RelocNet", "2.3"): (0.29, 11.29), ("Dense VLAD", "4.1"): (0.26, 13.11), ("PN L-W", "5.2"): (0.24, 7.87),
+        ("Node-Pose (ImageNet)", "4.1"): (0.19, 7.5), ("Graph-Pose (ImageNet)", "4.1"): (0.22, 7.74),
+        ("3D CNN, clips", "6.1"): (0.161, 7.2), ("2D CNN-RNN, clips", "6.1"): (0.21, 8.23),
+        ("Pose-LSTM", "6.1"): (0.32, 9.85), ("Linear-PoseNet (Places)", "5.2"): (0.31, 10.76),
+    }  # fmt: skip
+    for (system, table), (position_m, orientation_deg) in printed.items():
+        cells = [cell(system, table, scene) for scene in list(FRAMES)[:7]]
+        assert statistics.fmean(c[0] for c in cells) == pytest.approx(position_m, abs=0.006), system
+        if orientation_deg is not None:
+            assert statistics.fmean(c[1] or 0 for c in cells) == pytest.approx(orientation_deg, abs=0.02), system
+
+
+def test_rows_of_the_scenes_on_show() -> None:
+    report = report_on("redkitchen", "den")
+    add_published(report, [2])
+    rows = {row.system: row for row in report.rows}
+    assert len(rows) == 14
+    assert rows["SurfCNN 300"].kind == "published"
+    assert list(rows["SurfCNN 300"].cells) == ["redkitchen"]
+    assert rows["SurfCNN 300"].cells["redkitchen"].text == ("0.37", "10.25")
+    mean = rows["VidLoc"].mean
+    assert mean is not None
+    assert (mean.position_m, mean.orientation_deg, mean.scenes) == (0.31, None, 1)
+    assert any("table 2.3" in note and "recomputed" in note for note in report.footnotes)
+    assert any("structure-based" in note for note in report.footnotes)
+
+
+def test_tables_that_agree_share_a_row() -> None:
+    report = report_on("heads", "office", "redkitchen")
+    add_published(report)
+    sources = {(row.system, row.source) for row in report.rows}
+    assert {("PoseNet", "table 2.3, 3.2, 4.1, 5.2"), ("PoseNet", "table 6.1")} <= sources, "the office differs"
+    assert ("G-PoseNet", "table 2.3, 3.2, 5.2") in sources
+    assert ("G-PoseNet", "table 4.1") in sources, "there it has another row's cells"
+    assert ("SurfCNN", "table 3.2") in sources
+    assert ("SURF-CNN", "table 4.1, 5.2") in sources
+
+
+def test_cambridge_has_its_scenes() -> None:
+    report = report_on("KingsCollege", "ShopFacade", dataset="cambridge", ground_truth="sfm", test_frames="343")
+    add_published(report, [5])
+    dense = next(row for row in report.rows if row.system == "Dense-PoseNet (Places)")
+    assert [(c.position_m, c.orientation_deg) for c in dense.cells.values()] == [(1.5, 2.9), (0.75, 3.5)]
+    assert any("0.8/47" in note for note in report.footnotes)
+    assert not any("St Mary's" in note for note in report.footnotes)
+    assert any("ShopFacade is a cut, 343 test frames of 103" in note for note in report.notes)
+
+
+@pytest.mark.parametrize("facts", [{"dataset": "tum"}, {"ground_truth": "sfm"}, {"ground_truth": "synthetic"}], ids=str)
+def test_other_data_of_the_same_name_has_no_published_rows(facts: dict[str, str]) -> None:
+    report = report_on("office", **facts)
+    add_published(report)
+    assert report.rows == []
+    assert "no published row: none of the scenes on show (office)" in report.notes[0]
+
+
+def test_means_stand_beside_the_seven_scenes_alone() -> None:
+    whole, part = report_on(*SEVEN), report_on(*SEVEN[:6])
+    for report in (whole, part):
+        add_published(report)
+    means = {row.system: row.mean for row in whole.rows if not row.cells}
+    assert len(means) == 8
+    atloc = means["AtLoc"]
+    assert atloc is not None
+    assert (atloc.position_m, atloc.orientation_deg, atloc.scenes) == (0.20, 7.56, 7)
+    assert all(row.cells for row in part.rows)
+    assert any("means over the seven scenes are left out" in note for note in part.notes)
+
+
+@pytest.mark.parametrize(("task", "systems"), [("relative", 2), ("absolute", 5)])
+def test_clips_stand_beside_clips(task: str, systems: int) -> None:
+    report = report_on("heads", task=task)
+    add_published(report, [6])
+    assert len(report.rows) == systems
+    assert all(row.system.endswith("clips") == (task == "relative") for row in report.rows)
+    assert any("poses are left out" in note for note in report.notes)
+
+
+def test_a_model_trained_elsewhere_stands_beside_the_scene_it_was_tested_on() -> None:
+    report = report_on("room-0 to heads", task="relative")
+    add_published(report, [6])
+    assert [row.cells["room-0 to heads"].position_m for row in report.rows] == [0.187, 0.148]
+
+
+@pytest.mark.parametrize(
+    ("facts", "says"),
+    [
+        ({"test_frames": "150"}, "do not compare: redkitchen is a cut, 150 test frames of 5000"),
+        ({"split": "blocks"}, "do not compare: redkitchen has its own split (blocks)"),
+        ({}, "do not compare: redkitchen may be a cut, no run tells how many of the 5000 test frames it has"),
+        ({"test_frames": "5000"}, "published rows are of the same official test frames"),
+    ],
+)
+def test_what_does_not_compare_is_told(facts: dict[str, str], says: str) -> None:
+    report = report_on("redkitchen", **facts)
+    add_published(report, [5])
+    assert any(says in note for note in report.notes)
