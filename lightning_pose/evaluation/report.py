@@ -15,13 +15,16 @@ from lightning_pose.data.scene import Frame
 from lightning_pose.evaluation.base import Evaluation
 from lightning_pose.evaluation.clips import evaluate_clips
 from lightning_pose.evaluation.images import evaluate_images
-from lightning_pose.evaluation.table import print_results
+from lightning_pose.evaluation.table import print_results, results_markdown
 from lightning_pose.models.base import Pose, PoseModule
 from lightning_pose.models.clip import ClipModule
 from lightning_pose.tracking import MLflowLogger, log_localizer
 from lightning_pose.tum import write_sequences
 
 __all__ = ["TestReport"]
+
+NOTE = "mlflow.note.content"
+"""The tag that MLflow shows as a run's description, in Markdown."""
 
 
 class TestReport(Callback):
@@ -63,11 +66,13 @@ class TestReport(Callback):
             found = evaluate_images(trainer, pl_module, self._poses, model)
         self.results = {type(pl_module).__name__: model, **found.baselines}
         scene = trainer.datamodule.scene  # type: ignore[attr-defined]
-        print_results(self.results, f"{scene.name}, {pl_module.headline}", found.extras)
+        shown = self.results, f"{scene.name}, {pl_module.headline}", found.extras
+        print_results(*shown)
         logger = run_logger(trainer)
         if logger is None:
             return
         _log(logger, found)
+        _describe(logger, results_markdown(*shown))
         best = checkpoint_folder(trainer) / "best.ckpt"
         if self.log_model and best.is_file():
             log_localizer(logger, best)
@@ -85,6 +90,14 @@ def _log(logger: MLflowLogger, found: Evaluation) -> None:
     _log_trajectories(logger, found.trajectories)
     for file, figure in found.figures.items():
         logger.client.log_figure(str(logger.run_id), figure, f"figures/{file}.png")
+
+
+def _describe(logger: MLflowLogger, text: str) -> None:
+    """Make the table the run's description, unless a user has written one."""
+    run = str(logger.run_id)
+    written = logger.client.get_run(run).data.tags.get(NOTE)
+    if not written or "\n| test |" in written:
+        logger.client.set_tag(run, NOTE, text)
 
 
 def _log_trajectories(logger: MLflowLogger, trajectories: Mapping[str, tuple[list[Frame], Pose]]) -> None:

@@ -7,10 +7,13 @@ from mlflow.exceptions import MlflowException
 from optuna import Study
 
 from lightning_pose.sweeps.plan import Plan
+from lightning_pose.sweeps.results import best_trials, tally
 from lightning_pose.sweeps.trial import RUN
 from lightning_pose.tracking import MLflowLogger
 
-__all__ = ["close_run", "open_parent"]
+__all__ = ["close_run", "describe_parent", "open_parent"]
+
+SHOWN = 10
 
 
 def open_parent(study: Study, plan: Plan) -> tuple[MlflowClient, str]:
@@ -42,6 +45,23 @@ def open_parent(study: Study, plan: Plan) -> tuple[MlflowClient, str]:
         client.log_artifact(run, str(plan.file))
         client.log_artifact(run, str(plan.base))
     return client, run
+
+
+def describe_parent(client: MlflowClient, run: str, study: Study, plan: Plan) -> None:
+    """Make a table of the best trials the description of the study's run."""
+    keys = [parameter.key for parameter in plan.space]
+    names = ["trial", *(objective.metric for objective in plan.objectives), *keys]
+    rows = [
+        [str(trial.number), *(f"{value:.4g}" for value in trial.values), *(_cell(trial.params.get(key)) for key in keys)]
+        for trial in best_trials(study, plan)[:SHOWN]
+    ]
+    lines = [f"| {' | '.join(cells)} |" for cells in (names, ["---"] * len(names), *rows)]
+    reached = ", ".join(objective.metric for objective in plan.objectives)
+    client.set_tag(run, "mlflow.note.content", f"**Best by {reached}** ({tally(study)})\n\n" + "\n".join(lines))
+
+
+def _cell(value: object) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str("" if value is None else value)
 
 
 def close_run(client: MlflowClient, run: str | None) -> None:
