@@ -15,6 +15,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import cv2
+import numpy as np
+
 if TYPE_CHECKING:
     from playwright.sync_api import Locator, Page, Route
 
@@ -32,7 +35,7 @@ __all__ = [
     "unfold",
 ]
 
-PATIENCE = 60  # seconds, for a server that starts and for a page of it, on a busy machine
+PATIENCE = 40  # seconds, for a server that starts and for a page of it, on a busy machine
 
 
 def chromium() -> str | None:
@@ -113,8 +116,10 @@ def open_page(address: str, width: int = 1400, height: int = 1000) -> Iterator[P
 
 def open_runs(page: Page, address: str) -> None:
     """From the first page to the runs of the experiment, on the side of MLflow that is about training."""
-    page.goto(f"{address}/#/?workflowType=machine_learning")  # as the switch `Model training` does
-    page.get_by_role("link", name="lightning_pose", exact=True).first.click()
+    page.goto(f"{address}/#/")
+    page.get_by_role("heading", name="Welcome to MLflow").wait_for()
+    page.get_by_role("button", name="Model training").click()
+    page.get_by_role("row").get_by_role("link", name="lightning_pose", exact=True).click()
     page.get_by_role("heading", name="Runs").wait_for()
     page.get_by_role("row").filter(has=page.get_by_role("link")).first.wait_for()
 
@@ -148,9 +153,18 @@ def _is_run(link: Locator) -> bool:
     return "/runs/" in (link.get_attribute("href") or "")
 
 
-def unfold(page: Page, name: str) -> None:
-    """Show the runs that are nested in one of the table."""
-    row(page, name).get_by_role("gridcell").get_by_role("button").click()
+def unfold(page: Page, name: str, nested: str) -> None:
+    """Show the runs that are nested in one of the table; MLflow remembers it.
+
+    Args:
+        page: shows the table.
+        name: of the outer run.
+        nested: name of a run within.
+    """
+    row(page, name).wait_for()
+    if not row(page, nested).count():
+        row(page, name).get_by_role("gridcell").get_by_role("button").click()
+    row(page, nested).wait_for()
 
 
 def open_figure(page: Page, file: str) -> int:
@@ -187,6 +201,8 @@ class Compared:
 
     def parallel_coordinates(self, params: Sequence[str], metrics: Sequence[str]) -> dict[str, list[float]]:
         """Choose the axes of the parallel coordinates; each run's place on each axis that is drawn."""
+        from playwright.sync_api import expect
+
         panel = self.panel("Parallel Coordinates Plot")
         self.page.get_by_role("button", name="Clear All").click()
         for box, names in zip(panel.get_by_role("combobox").all(), (params, metrics), strict=True):
@@ -195,15 +211,17 @@ class Compared:
                 box.fill(name)
                 box.press("Enter")
                 box.press("Escape")
-        titles = panel.locator(".axis-title")
-        titles.nth(len(params) + len(metrics) - 1).wait_for()
-        assert titles.all_text_contents() == [*params, *metrics]
-        assert all(canvas.is_visible() for canvas in panel.locator("canvas.gl-canvas-context").all())
+        expect(panel.locator(".axis-title")).to_have_text([*params, *metrics], timeout=PATIENCE * 1000)
+        assert self._patches(panel) > 0, "lines are drawn"
         (plot,) = self._plots(panel)
         return {axis["label"]: axis["values"] for axis in plot["dimensions"]}
 
     def scatter(self, x: str, y: str) -> list[tuple[float, float]]:
-        """Choose the axes of the scatter plot; its points, each of them drawn."""
+        """Choose the axes of the scatter plot; its points.
+
+        Raises:
+            AssertionError: not as many dots are to be seen; points may not overlap.
+        """
         panel = self.panel("Scatter Plot")
         for box, name in zip(panel.get_by_role("combobox").all(), (x, y), strict=True):
             box.click()
@@ -211,7 +229,7 @@ class Compared:
         for axis, name in (("x", x), ("y", y)):
             panel.locator(f".{axis}title").filter(has_text=name).wait_for()
         (plot,) = self._plots(panel)
-        assert panel.locator(".scatterlayer path.point").count() == len(plot["x"])
+        assert self._patches(panel, wanted=len(plot["x"])) == len(plot["x"])
         return list(zip(plot["x"], plot["y"], strict=True))
 
     def differing_parameters(self) -> list[str]:
@@ -224,3 +242,15 @@ class Compared:
 
     def _plots(self, panel: Locator) -> list[dict[str, Any]]:
         return panel.locator(".js-plotly-plot").evaluate("plot => plot.data")
+
+    def _patches(self, panel: Locator, wanted: int | None = None) -> int:
+        """Patches of colour in the plot, as seen: plotly draws on a canvas, and takes its time."""
+        count = 0
+        for _ in range(20):
+            picture = np.frombuffer(panel.locator(".js-plotly-plot").screenshot(), np.uint8)
+            saturation = cv2.cvtColor(cv2.imdecode(picture, cv2.IMREAD_COLOR), cv2.COLOR_BGR2HSV)[..., 1]
+            count = cv2.connectedComponents((saturation > 100).astype(np.uint8))[0] - 1  # without the background
+            if count == wanted or (count and wanted is None):
+                break
+            self.page.wait_for_timeout(250)
+        return count

@@ -67,8 +67,8 @@ class ClipModule(PoseModule):
 
     @property
     def headline(self) -> str:
-        shape = "x".join(map(str, self.input_shape))
-        return (f"N={self.input_shape[0]}" if len(self.input_shape) == 2 else shape) + " motion" * self.motion + " integrated" * self.integrate
+        shape = f"N={self.input_shape[0]}" if len(self.input_shape) == 2 else "x".join(map(str, self.input_shape))
+        return shape + " motion" * self.motion + " integrated" * self.integrate
 
     def check_data(self, datamodule: Any) -> None:
         super().check_data(datamodule)

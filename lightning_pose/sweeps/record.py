@@ -52,7 +52,7 @@ def describe_parent(client: MlflowClient, run: str, study: Study, plan: Plan) ->
     keys = [parameter.key for parameter in plan.space]
     names = ["trial", *(objective.metric for objective in plan.objectives), *keys]
     rows = [
-        [str(trial.number), *(f"{value:.4g}" for value in trial.values), *(_cell(trial.params.get(key)) for key in keys)]
+        [_cell(cell) for cell in (trial.number, *trial.values, *(trial.params.get(key, "") for key in keys))]
         for trial in best_trials(study, plan)[:SHOWN]
     ]
     lines = [f"| {' | '.join(cells)} |" for cells in (names, ["---"] * len(names), *rows)]
@@ -61,7 +61,7 @@ def describe_parent(client: MlflowClient, run: str, study: Study, plan: Plan) ->
 
 
 def _cell(value: object) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str("" if value is None else value)
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def close_run(client: MlflowClient, run: str | None) -> None:
