@@ -2,7 +2,7 @@
 
     python -m docs.screenshot docs/mlflow_compare.png "LinearPoseNet redkitchen D=1280" "SurfLSTM redkitchen N=50" ...
 
-Run it from the repository; the names are those of runs in `--folder DIR`'s `mlruns/mlflow.db`.
+Run it from the repository; the names are those of runs in the `mlruns/mlflow.db` of `--folder DIR`.
 """
 
 from __future__ import annotations

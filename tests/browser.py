@@ -209,7 +209,7 @@ class Compared:
             for name in names:
                 box.click()
                 box.fill(name)
-                box.press("Enter")
+                self.page.get_by_title(name, exact=True).click()  # Enter would take what merely begins so
                 box.press("Escape")
         expect(panel.locator(".axis-title")).to_have_text([*params, *metrics], timeout=PATIENCE * 1000)
         assert self._patches(panel) > 0, "lines are drawn"

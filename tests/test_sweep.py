@@ -118,7 +118,7 @@ def test_a_sweep_leaves_runs_and_a_config_that_trains_and_goes_on(
     assert config["trainer"]["max_epochs"] == 1
     description = parent.data.tags["mlflow.note.content"]
     assert "2 complete" in description
-    assert f"| {best.number} | {best.value:.4g} | {best.params['model.units']} |" in description
+    assert f"| {best.number} | {best.value:.4g} | units {best.params['model.units']} |" in description
     kept = {file.path for folder in (None, "figures") for file in
             workplace.client.list_artifacts(parent.info.run_id, folder)}  # fmt: skip
     assert {"best.yaml", "units.yaml", "tiny.yaml", "figures/history.png", "figures/slice.png"} <= kept

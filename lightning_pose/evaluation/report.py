@@ -66,13 +66,12 @@ class TestReport(Callback):
             found = evaluate_images(trainer, pl_module, self._poses, model)
         self.results = {type(pl_module).__name__: model, **found.baselines}
         scene = trainer.datamodule.scene  # type: ignore[attr-defined]
-        shown = self.results, f"{scene.name}, {pl_module.headline}", found.extras
-        print_results(*shown)
+        print_results(self.results, f"{scene.name}, {pl_module.headline}", found.extras)
         logger = run_logger(trainer)
         if logger is None:
             return
         _log(logger, found)
-        _describe(logger, results_markdown(*shown))
+        _describe(logger, results_markdown(self.results, found.extras))
         best = checkpoint_folder(trainer) / "best.ckpt"
         if self.log_model and best.is_file():
             log_localizer(logger, best)
@@ -96,7 +95,7 @@ def _describe(logger: MLflowLogger, text: str) -> None:
     """Make the table the run's description, unless a user has written one."""
     run = str(logger.run_id)
     written = logger.client.get_run(run).data.tags.get(NOTE)
-    if not written or "\n| test |" in written:
+    if not written or written.startswith("| test |"):
         logger.client.set_tag(run, NOTE, text)
 
 

@@ -45,11 +45,10 @@ def print_results(results: Mapping[str, Mapping[str, float]], title: str, extras
     Console(width=None if sys.stdout.isatty() else 120).print(table)
 
 
-def results_markdown(results: Mapping[str, Mapping[str, float]], title: str, extras: Mapping[str, float]) -> str:
-    """The same as a Markdown page: fewer columns, because a run's description is narrow."""
+def results_markdown(results: Mapping[str, Mapping[str, float]], extras: Mapping[str, float]) -> str:
+    """The same in Markdown: fewer columns and no title, because MLflow shows a narrow description, and folds it."""
     columns = {name: COLUMNS[name] for name in IN_MARKDOWN}
     lines = [
-        f"**{title}**\n",
         f"| test | {' | '.join(heading.replace(chr(10), ' ') for heading, _ in columns.values())} |",
         f"|---|{'---:|' * len(columns)}",
     ]

@@ -49,15 +49,14 @@ def open_parent(study: Study, plan: Plan) -> tuple[MlflowClient, str]:
 
 def describe_parent(client: MlflowClient, run: str, study: Study, plan: Plan) -> None:
     """Make a table of the best trials the description of the study's run."""
-    keys = [parameter.key for parameter in plan.space]
-    names = ["trial", *(objective.metric for objective in plan.objectives), *keys]
-    rows = [
-        [_cell(cell) for cell in (trial.number, *trial.values, *(trial.params.get(key, "") for key in keys))]
-        for trial in best_trials(study, plan)[:SHOWN]
-    ]
-    lines = [f"| {' | '.join(cells)} |" for cells in (names, ["---"] * len(names), *rows)]
-    reached = ", ".join(objective.metric for objective in plan.objectives)
-    client.set_tag(run, "mlflow.note.content", f"**Best by {reached}** ({tally(study)})\n\n" + "\n".join(lines))
+    names = [objective.metric for objective in plan.objectives]
+    lines = [f"{tally(study)}\n", f"| trial | {' | '.join(names)} | settings |", f"|---|{'---|' * len(names)}---|"]
+    for trial in best_trials(study, plan)[:SHOWN]:
+        values = " | ".join(_cell(value) for value in trial.values)
+        # In one column, which wraps: a wide table pushes the rest off MLflow's page.
+        settings = ", ".join(f"{key.partition('.')[2]} {_cell(value)}" for key, value in trial.params.items())
+        lines.append(f"| {trial.number} | {values} | {settings} |")
+    client.set_tag(run, "mlflow.note.content", "\n".join(lines))
 
 
 def _cell(value: object) -> str:
