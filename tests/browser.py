@@ -35,7 +35,7 @@ __all__ = [
     "unfold",
 ]
 
-PATIENCE = 40  # seconds, for a server that starts and for a page of it, on a busy machine
+PATIENCE = 60  # seconds, for a server that starts and for a page of it, on a busy machine
 
 
 def chromium() -> str | None:
@@ -248,8 +248,9 @@ class Compared:
         count = 0
         for _ in range(20):
             picture = np.frombuffer(panel.locator(".js-plotly-plot").screenshot(), np.uint8)
-            saturation = cv2.cvtColor(cv2.imdecode(picture, cv2.IMREAD_COLOR), cv2.COLOR_BGR2HSV)[..., 1]
-            count = cv2.connectedComponents((saturation > 100).astype(np.uint8))[0] - 1  # without the background
+            pixels = np.asarray(cv2.imdecode(picture, cv2.IMREAD_COLOR)).astype(int)
+            colored = np.ptp(pixels, axis=-1) > 60  # axes and letters are gray
+            count = cv2.connectedComponents(colored.astype(np.uint8))[0] - 1  # without the background
             if count == wanted or (count and wanted is None):
                 break
             self.page.wait_for_timeout(250)

@@ -10,8 +10,10 @@ import torch
 
 from lightning_pose.data.formats import load_scene
 from lightning_pose.evaluation import print_results
+from lightning_pose.evaluation.report import NOTE, describe_run
 from lightning_pose.geometry import orientation_error_deg, position_error_m
 from lightning_pose.summary import summarize_errors
+from lightning_pose.tracking import MLflowLogger
 from tests.helpers import Trained, Workplace
 
 
@@ -102,3 +104,17 @@ def test_retrieval_searches_what_the_model_has_learnt_from(workplace: Workplace,
     for refit, known in (("false", places["train"]), ("true", np.concatenate([places["train"], places["val"]]))):
         nearest = np.linalg.norm(places["test"][:, None] - known, axis=2).min(1)
         assert oracles[refit] == pytest.approx(nearest.mean(), abs=1e-5)
+
+
+def test_the_description_of_a_run_is_its_table_unless_a_user_wrote_one(trained: Trained, workplace: Workplace) -> None:
+    tags, metrics = trained.run.data.tags, trained.run.data.metrics
+    rows = [line.split(" | ") for line in tags[NOTE].splitlines()]
+    assert rows[0][:3] == ["| test", "median m", "median deg"]
+    assert rows[2][:2] == ["| **SurfLSTM**", f"{metrics['test/position_median_m']:.3f}"]
+    assert [row[0] for row in rows[3:7]] == ["| train_mean", "| retrieval_top1", "| retrieval_top5", "| oracle"]
+    assert {len(row) for row in rows[:1] + rows[2:7]} == {7}
+    logger = MLflowLogger(tracking_uri=workplace.uri)
+    for before, after in (("", tags[NOTE]), ("**the one to keep**", "**the one to keep**")):
+        logger.client.set_tag(str(logger.run_id), NOTE, before)
+        describe_run(logger, tags[NOTE])
+        assert logger.client.get_run(str(logger.run_id)).data.tags[NOTE] == after

@@ -21,7 +21,7 @@ from lightning_pose.models.clip import ClipModule
 from lightning_pose.tracking import MLflowLogger, log_localizer
 from lightning_pose.tum import write_sequences
 
-__all__ = ["TestReport"]
+__all__ = ["NOTE", "TestReport", "describe_run"]
 
 NOTE = "mlflow.note.content"
 """The tag that MLflow shows as a run's description, in Markdown."""
@@ -71,7 +71,7 @@ class TestReport(Callback):
         if logger is None:
             return
         _log(logger, found)
-        _describe(logger, results_markdown(self.results, found.extras))
+        describe_run(logger, results_markdown(self.results, found.extras))
         best = checkpoint_folder(trainer) / "best.ckpt"
         if self.log_model and best.is_file():
             log_localizer(logger, best)
@@ -91,7 +91,7 @@ def _log(logger: MLflowLogger, found: Evaluation) -> None:
         logger.client.log_figure(str(logger.run_id), figure, f"figures/{file}.png")
 
 
-def _describe(logger: MLflowLogger, text: str) -> None:
+def describe_run(logger: MLflowLogger, text: str) -> None:
     """Make the table the run's description, unless a user has written one."""
     run = str(logger.run_id)
     written = logger.client.get_run(run).data.tags.get(NOTE)
