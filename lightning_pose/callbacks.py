@@ -98,11 +98,18 @@ class RunRecorder(Callback):
             logger.client.log_text(run_id, self.config_yaml, "config.yaml")
 
     def _name(self, trainer: Trainer, module: LightningModule, logger: MLflowLogger, stage: str) -> str | None:
-        if logger.client.get_run(str(logger.run_id)).data.params:
+        kept = logger.client.get_run(str(logger.run_id)).data
+        if kept.params:
             return None  # a run that goes on keeps its name
-        scene = trainer.datamodule.scene.name  # type: ignore[attr-defined]
-        name = f"{type(module).__name__} {scene} {module.headline}"
-        return logger._run_name or (name if stage == "fit" else f"{name} (test)")
+        scene, seed = trainer.datamodule.scene.name, _seed()  # type: ignore[attr-defined]
+        trial = kept.tags.get("sweep.trial")
+        parts = (
+            f"{type(module).__name__} {scene} {module.headline}",
+            f"seed={seed}" if seed else "",
+            "" if stage == "fit" else "(test)",
+        )
+        name = logger._run_name or " ".join(part for part in parts if part)
+        return name if trial is None else f"{name} trial {trial}"
 
     @staticmethod
     def _tags(trainer: Trainer, module: LightningModule, stage: str) -> dict[str, str]:
@@ -141,10 +148,21 @@ def train_seconds(trainer: Trainer) -> float | None:
     return (timers[0].time_elapsed("train") or None) if timers else None
 
 
+_OF_THE_MACHINE = ("cache_dir", "workers", "eval_batch_size")
+"""Settings of the data that change nothing in the result, and would only differ where runs are compared."""
+
+
 def _settings(trainer: Trainer, module: LightningModule) -> dict[str, Any]:
+    datamodule = trainer.datamodule  # type: ignore[attr-defined]
+    data = datamodule.describe()
+    kept = {name: value for name, value in data["init_args"].items() if name not in _OF_THE_MACHINE}
     return {
-        "model": module.describe(),  # type: ignore[operator]
-        "data": trainer.datamodule.describe(),  # type: ignore[attr-defined]
+        # The name for the class path, which `config.yaml` has: MLflow's plots cut values off after some ten letters.
+        "architecture": type(module).__name__,
+        "scene": datamodule.scene.name,
+        "features": datamodule.extractor.name,
+        "model": module.describe()["init_args"],  # type: ignore[operator]
+        "data": data | {"init_args": kept},
         "trainer": {"max_epochs": trainer.max_epochs, "precision": trainer.precision},
         "seed": _seed(),
     }

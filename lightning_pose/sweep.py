@@ -157,6 +157,7 @@ def _best_so_far(study: Study, plan: Plan) -> str:
 
 def _conclude(study: Study, plan: Plan, client: MlflowClient, parent: str, folder: Path) -> None:
     """Print the best trials, and keep their config and figures in a folder and in the study's run."""
+    from lightning_pose.sweeps.record import describe_parent
     from lightning_pose.sweeps.results import best_trial, draw_figures, show_study, table, tally, write_best
     from lightning_pose.sweeps.trial import REASON
 
@@ -176,6 +177,7 @@ def _conclude(study: Study, plan: Plan, client: MlflowClient, parent: str, folde
     for objective, value in zip(plan.objectives, best.values, strict=True):
         client.log_metric(parent, f"best/{objective.metric}", value)
     client.set_tag(parent, "sweep.best_trial", str(best.number))
+    describe_parent(client, parent, study, plan)
     if rows is None or plan.measure is None:
         Console().print(table(study, plan))
     if rows is not None:

@@ -46,6 +46,8 @@ def test_tags_and_parameters(trained: Trained) -> None:
     assert params["data.extractor.class_path"] == "tests.helpers.Thumbnails"
     assert params["data.root"] == str(trained.workplace.scene)
     assert (params["trainer.max_epochs"], params["seed"]) == ("2", "0")
+    assert (params["architecture"], params["scene"], params["features"]) == ("SurfLSTM", "wall", "thumbnails")
+    assert not {"data.workers", "data.cache_dir"} & params.keys(), "they change no result"
 
 
 @pytest.mark.skipif(not (REPOSITORY / ".git").exists() or not shutil.which("git"), reason="no git checkout")

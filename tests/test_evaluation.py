@@ -11,10 +11,12 @@ import torch
 from lightning_pose.data.formats import load_scene
 from lightning_pose.evaluation import print_results
 from lightning_pose.evaluation.base import count_layers
+from lightning_pose.evaluation.report import NOTE, describe_run
 from lightning_pose.geometry import orientation_error_deg, position_error_m
 from lightning_pose.models import DensePoseNet, LinearPoseNet, NodePose, SurfCNN, SurfLSTM
 from lightning_pose.models.base import PoseModule
 from lightning_pose.summary import summarize_errors
+from lightning_pose.tracking import MLflowLogger
 from tests.helpers import Trained, Workplace
 
 
@@ -120,3 +122,17 @@ def test_retrieval_searches_what_the_model_has_learnt_from(workplace: Workplace,
 )
 def test_layers_are_counted_as_the_thesis_does(model: PoseModule, layers: int) -> None:
     assert count_layers(model.network) == layers  # type: ignore[arg-type]
+
+
+def test_the_description_of_a_run_is_its_table_unless_a_user_wrote_one(trained: Trained, workplace: Workplace) -> None:
+    tags, metrics = trained.run.data.tags, trained.run.data.metrics
+    rows = [line.split(" | ") for line in tags[NOTE].splitlines()]
+    assert rows[0][:3] == ["| test", "median m", "median deg"]
+    assert rows[2][:2] == ["| **SurfLSTM**", f"{metrics['test/position_median_m']:.3f}"]
+    assert [row[0] for row in rows[3:7]] == ["| train_mean", "| retrieval_top1", "| retrieval_top5", "| oracle"]
+    assert {len(row) for row in rows[:1] + rows[2:7]} == {7}
+    logger = MLflowLogger(tracking_uri=workplace.uri)
+    for before, after in (("", tags[NOTE]), ("**the one to keep**", "**the one to keep**")):
+        logger.client.set_tag(str(logger.run_id), NOTE, before)
+        describe_run(logger, tags[NOTE])
+        assert logger.client.get_run(str(logger.run_id)).data.tags[NOTE] == after

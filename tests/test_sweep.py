@@ -119,7 +119,7 @@ def test_a_sweep_leaves_runs_and_a_config_that_trains_and_goes_on(
     by_number = {trial.number: trial for trial in trials(workplace)}
     for run in children:
         trial = by_number[int(run.data.tags["sweep.trial"])]
-        assert run.info.run_name == f"trial {trial.number}"
+        assert run.info.run_name == f"SurfLSTM wall N=6 trial {trial.number}"
         assert run.data.params["model.units"] == str(trial.params["model.units"])
         assert run.data.metrics["val/position_median_m"] == pytest.approx(trial.value)
         assert not any(name.startswith(("test/", "baseline/")) for name in run.data.metrics), "test frames chose"
@@ -131,6 +131,9 @@ def test_a_sweep_leaves_runs_and_a_config_that_trains_and_goes_on(
     config = yaml.safe_load((folder / "best.yaml").read_text())
     assert config["model"]["init_args"]["units"] == best.params["model.units"]
     assert config["trainer"]["max_epochs"] == 1
+    description = parent.data.tags["mlflow.note.content"]
+    assert "2 complete" in description
+    assert f"| {best.number} | {best.value:.4g} | units {best.params['model.units']} |" in description
     kept = {file.path for folder in (None, "figures") for file in
             workplace.client.list_artifacts(parent.info.run_id, folder)}  # fmt: skip
     assert {"best.yaml", "units.yaml", "tiny.yaml", "figures/history.png", "figures/slice.png"} <= kept

@@ -15,13 +15,16 @@ from lightning_pose.data.scene import Frame
 from lightning_pose.evaluation.base import Evaluation
 from lightning_pose.evaluation.clips import evaluate_clips
 from lightning_pose.evaluation.images import evaluate_images
-from lightning_pose.evaluation.table import print_results
+from lightning_pose.evaluation.table import print_results, results_markdown
 from lightning_pose.models.base import Pose, PoseModule
 from lightning_pose.models.clip import ClipModule
 from lightning_pose.tracking import MLflowLogger, log_localizer
 from lightning_pose.tum import write_sequences
 
-__all__ = ["TestReport"]
+__all__ = ["NOTE", "TestReport", "describe_run"]
+
+NOTE = "mlflow.note.content"
+"""The tag that MLflow shows as a run's description, in Markdown."""
 
 
 class TestReport(Callback):
@@ -70,6 +73,7 @@ class TestReport(Callback):
         if logger is None:
             return
         _log(logger, found)
+        describe_run(logger, results_markdown(self.results, found.extras))
         best = checkpoint_folder(trainer) / "best.ckpt"
         if self.log_model and best.is_file():
             log_localizer(logger, best)
@@ -87,6 +91,14 @@ def _log(logger: MLflowLogger, found: Evaluation) -> None:
     _log_trajectories(logger, found.trajectories)
     for file, figure in found.figures.items():
         logger.client.log_figure(str(logger.run_id), figure, f"figures/{file}.png")
+
+
+def describe_run(logger: MLflowLogger, text: str) -> None:
+    """Make the table the run's description, unless a user has written one."""
+    run = str(logger.run_id)
+    written = logger.client.get_run(run).data.tags.get(NOTE)
+    if not written or written.startswith("| test |"):
+        logger.client.set_tag(run, NOTE, text)
 
 
 def _log_trajectories(logger: MLflowLogger, trajectories: Mapping[str, tuple[list[Frame], Pose]]) -> None:

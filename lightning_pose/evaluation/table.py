@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from rich.console import Console
 from rich.table import Table
 
-__all__ = ["print_results"]
+__all__ = ["print_results", "results_markdown"]
 
 COLUMNS = {
     "position_median_m": ("median\nm", "{:.3f}"),
@@ -23,6 +23,15 @@ COLUMNS = {
     "recall_50cm_5deg": ("50 cm\n5 deg", "{:.0%}"),
 }
 
+IN_MARKDOWN = (
+    "position_median_m",
+    "orientation_median_deg",
+    "position_p95_m",
+    "orientation_p95_deg",
+    "recall_5cm_5deg",
+    "recall_10cm_5deg",
+)
+
 
 def print_results(results: Mapping[str, Mapping[str, float]], title: str, extras: Mapping[str, float]) -> None:
     """Print one row a system, best known facts first, and the skill and costs below."""
@@ -34,6 +43,19 @@ def print_results(results: Mapping[str, Mapping[str, float]], title: str, extras
         cells = [form.format(metrics[name]) for name, (_, form) in COLUMNS.items()]
         table.add_row(system, *cells, style="bold" if i == 0 else None, end_section=i == 0)
     Console(width=None if sys.stdout.isatty() else 120).print(table)
+
+
+def results_markdown(results: Mapping[str, Mapping[str, float]], extras: Mapping[str, float]) -> str:
+    """The same in Markdown: fewer columns and no title, because MLflow shows a narrow description, and folds it."""
+    columns = {name: COLUMNS[name] for name in IN_MARKDOWN}
+    lines = [
+        f"| test | {' | '.join(heading.replace(chr(10), ' ') for heading, _ in columns.values())} |",
+        f"|---|{'---:|' * len(columns)}",
+    ]
+    for i, (system, metrics) in enumerate(results.items()):
+        cells = [form.format(metrics[name]) for name, (_, form) in columns.items()]
+        lines.append(f"| {' | '.join([f'**{system}**' if i == 0 else system, *cells])} |")
+    return "\n".join([*lines, "", "; ".join(_said(name, value) for name, value in extras.items())])
 
 
 def _said(name: str, value: float) -> str:

@@ -67,7 +67,7 @@ class ClipModule(PoseModule):
 
     @property
     def headline(self) -> str:
-        shape = "x".join(map(str, self.input_shape))
+        shape = f"N={self.input_shape[0]}" if len(self.input_shape) == 2 else "x".join(map(str, self.input_shape))
         return shape + " motion" * self.motion + " integrated" * self.integrate
 
     def check_data(self, datamodule: Any) -> None:

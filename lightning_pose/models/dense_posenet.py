@@ -56,7 +56,7 @@ class DensePoseNet(PoseModule):
 
     @property
     def headline(self) -> str:
-        return str(self.input_shape[0]) + (f" K={self.components}" if self.components else "")
+        return f"D={self.input_shape[0]}" + (f" components={self.components}" if self.components else "")
 
     def setup(self, stage: str) -> None:
         super().setup(stage)

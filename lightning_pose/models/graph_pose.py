@@ -68,7 +68,7 @@ class GraphPose(PoseModule):
 
     @property
     def headline(self) -> str:
-        return f"K={self.neighbours}"
+        return f"D={self.input_shape[0]} neighbours={self.neighbours}"
 
 
 class _CellNetwork(nn.Module):

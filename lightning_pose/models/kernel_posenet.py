@@ -56,7 +56,7 @@ class KernelPoseNet(LinearPoseNet):
 
     @property
     def headline(self) -> str:
-        return f"{super().headline} gamma={self.gamma:g}"
+        return f"D={self.input_shape[0]} gamma={self.gamma:g}"
 
     def setup(self, stage: str) -> None:
         super().setup(stage)

@@ -65,7 +65,7 @@ class LinearPoseNet(PoseModule):
 
     @property
     def headline(self) -> str:
-        return str(self.input_shape[0]) + (f" K={self.components}" if self.components else "")
+        return f"D={self.input_shape[0]}" + (f" components={self.components}" if self.components else "")
 
     @property
     def learns_from(self) -> tuple[str, ...]:

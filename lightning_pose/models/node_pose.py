@@ -107,7 +107,7 @@ class NodePose(PoseModule):
 
     @property
     def headline(self) -> str:
-        return f"K={self.neighbours}"
+        return f"D={self.input_shape[0]} neighbours={self.neighbours}"
 
     def setup(self, stage: str) -> None:
         super().setup(stage)

@@ -7,10 +7,13 @@ from mlflow.exceptions import MlflowException
 from optuna import Study
 
 from lightning_pose.sweeps.plan import Plan
+from lightning_pose.sweeps.results import best_trials, tally
 from lightning_pose.sweeps.trial import RUN
 from lightning_pose.tracking import MLflowLogger
 
-__all__ = ["close_run", "open_parent"]
+__all__ = ["close_run", "describe_parent", "open_parent"]
+
+SHOWN = 10
 
 
 def open_parent(study: Study, plan: Plan) -> tuple[MlflowClient, str]:
@@ -43,6 +46,22 @@ def open_parent(study: Study, plan: Plan) -> tuple[MlflowClient, str]:
         for base in plan.bases.values():
             client.log_artifact(run, str(base))
     return client, run
+
+
+def describe_parent(client: MlflowClient, run: str, study: Study, plan: Plan) -> None:
+    """Make a table of the best trials the description of the study's run."""
+    names = [objective.metric for objective in plan.objectives]
+    lines = [f"{tally(study)}\n", f"| trial | {' | '.join(names)} | settings |", f"|---|{'---|' * len(names)}---|"]
+    for trial in best_trials(study, plan)[:SHOWN]:
+        values = " | ".join(_cell(value) for value in trial.values)
+        # In one column, which wraps: a wide table pushes the rest off MLflow's page.
+        settings = ", ".join(f"{key.partition('.')[2]} {_cell(value)}" for key, value in trial.params.items())
+        lines.append(f"| {trial.number} | {values} | {settings} |")
+    client.set_tag(run, "mlflow.note.content", "\n".join(lines))
+
+
+def _cell(value: object) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def close_run(client: MlflowClient, run: str | None) -> None:

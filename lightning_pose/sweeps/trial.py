@@ -175,7 +175,7 @@ def run_trial(trial: Trial, plan: Plan, parent: str) -> float | list[float]:
     uri, experiment = plan.tracking
     client = MlflowClient(uri)
     tags = {"mlflow.parentRunId": parent, "sweep.study": trial.study.study_name, "sweep.trial": str(trial.number)}
-    name = f"trial {trial.number}"
+    name = f"{trial.study.study_name} trial {trial.number}"  # until its settings are known
     known = client.get_experiment_by_name(experiment)
     assert known is not None, "the study's run is in it"
     run = client.create_run(known.experiment_id, run_name=name, tags=tags | process_tags()).info.run_id
@@ -184,7 +184,7 @@ def run_trial(trial: Trial, plan: Plan, parent: str) -> float | list[float]:
         values = draw(trial, plan.space)
         for key, value in values.items():
             client.set_tag(run, f"sweep.{key}", str(value))
-        logger = [f"--trainer.logger.run_id={run}", f"--trainer.logger.run_name={name}"]
+        logger = [f"--trainer.logger.run_id={run}"]
         if plan.measure == "features":
             return _features(trial, plan, values, client, run)
         return _fit(trial, plan, [*plan.arguments(values), *logger], client, run)

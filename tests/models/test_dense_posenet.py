@@ -38,8 +38,8 @@ def test_it_reads_principal_components_of_the_training_features() -> None:
 
 
 def test_headline_names_what_differs() -> None:
-    assert DensePoseNet(input_shape=[32]).headline == "32"
-    assert DensePoseNet(input_shape=[32], components=8).headline == "32 K=8"
+    assert DensePoseNet(input_shape=[32]).headline == "D=32"
+    assert DensePoseNet(input_shape=[32], components=8).headline == "D=32 components=8"
 
 
 def test_more_components_than_there_are_is_refused() -> None:

@@ -86,7 +86,7 @@ def test_equal_frames_will_do() -> None:
 
 
 def test_headline_names_what_differs() -> None:
-    assert KernelPoseNet(input_shape=[32], gamma=0.25).headline == "32 gamma=0.25"
+    assert KernelPoseNet(input_shape=[32], gamma=0.25).headline == "D=32 gamma=0.25"
 
 
 @pytest.mark.parametrize("settings", [{"gamma": 0.0}, {"landmarks": 0}])

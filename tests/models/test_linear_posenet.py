@@ -136,8 +136,8 @@ def test_the_thesis_counts_its_parameters(components: int | None, count: int, tm
 
 
 def test_headline_names_what_differs() -> None:
-    assert LinearPoseNet(input_shape=[32]).headline == "32"
-    assert LinearPoseNet(input_shape=[32], components=8).headline == "32 K=8"
+    assert LinearPoseNet(input_shape=[32]).headline == "D=32"
+    assert LinearPoseNet(input_shape=[32], components=8).headline == "D=32 components=8"
 
 
 @pytest.mark.parametrize("lambdas", [[], [0.0], [1.0, -2.0]])
