@@ -80,11 +80,9 @@ def _take(cell: Cell, trial: FrozenTrial) -> None:
 
 def _rank(value: Any, choices: Sequence[Any]) -> tuple[int, float]:
     """Numbers in their order, choices in that of the file, what is not searched there first."""
-    if value is None and None not in choices:
-        return (0, 0.0)
-    if value in choices:
-        return (1, float(choices.index(value)) if not _is_number(value) else float(value))
-    return (1, float(value)) if _is_number(value) else (2, 0.0)
+    if all(map(_is_number, choices)) and _is_number(value):
+        return (1, float(value))
+    return (1, float(choices.index(value))) if value in choices else (0, 0.0)
 
 
 def _is_number(value: Any) -> bool:

@@ -13,14 +13,14 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
 from lightning_pose.images import read_rgb
-from lightning_pose.plots import BASELINES, STYLE
+from lightning_pose.plots import BASELINES, MODEL, OTHERS, STYLE
 from lightning_pose.sweeps.cells import Cell, named, varying
 from lightning_pose.sweeps.exhibit import Exhibit
 from lightning_pose.sweeps.features import FrameKeypoints
 
 __all__ = ["draw_cells", "draw_keypoints"]
 
-COLORS = matplotlib.color_sequences["petroff8"]
+COLORS = [MODEL, *(color for color, _ in OTHERS), "#117733", "#999933", "#332288", "#1a1a1a"]
 STRONGEST = (10, 50, 100, 300)
 Lines = dict[str, list[Cell]]
 
@@ -63,14 +63,16 @@ def _lines(cells: Sequence[Cell], exhibit: Exhibit) -> Lines:
     apart = [key for key in varying(cells) if key != exhibit.x]
     lines: Lines = {}
     for cell in cells:
-        parts = [_told(key, cell.values[key], exhibit, len(apart)) for key in apart if key in cell.values]
+        parts = [_told(key, cell.values[key], exhibit) for key in apart if key in cell.values]
         lines.setdefault(", ".join(parts) or "model", []).append(cell)
     return lines
 
 
-def _told(key: str, value: Any, exhibit: Exhibit, several: int) -> str:
+def _told(key: str, value: Any, exhibit: Exhibit) -> str:
     """A setting in a legend: its value, and its name where that does not speak for itself."""
-    return named(value) if isinstance(value, str) or several == 0 else f"{exhibit.label(key)} {named(value)}"
+    if key == "data.root":
+        return named(value) if value else "synthetic room"
+    return named(value) if isinstance(value, str) else f"{exhibit.label(key)} {named(value)}"
 
 
 def _settings(axes: Axes, lines: Lines, metric: str, exhibit: Exhibit) -> None:
@@ -128,7 +130,8 @@ def _thinned(ticks: list[float]) -> list[float]:
 def _curves(axes: Axes, lines: Lines, name: str, exhibit: Exhibit) -> None:
     for i, (label, cells) in enumerate(lines.items()):
         curve = cells[0].curve(name)
-        axes.plot(list(curve), list(curve.values()), "o-", color=COLORS[i % len(COLORS)], markersize=3, label=label)
+        steps = {"drawstyle": "steps-post"} if name.endswith("histogram") else {"marker": "o", "markersize": 3}
+        axes.plot(list(curve), list(curve.values()), color=COLORS[i % len(COLORS)], label=label, **steps)
     for baseline in exhibit.beside:
         curve = next(iter(lines.values()))[0].curve(name.replace("test/", f"baseline/{baseline}/"))
         color, dash = BASELINES.get(baseline, ("#8c8c8c", "--"))
@@ -160,12 +163,13 @@ def draw_keypoints(frames: Mapping[str, FrameKeypoints], title: str) -> Figure:
     figure = Figure(figsize=(3 * len(STRONGEST), 2.5 * len(frames) + 0.5), dpi=120, layout="constrained")
     figure.suptitle(title, x=0.015, ha="left", fontsize=12, fontweight="bold")
     panels = figure.subplots(len(frames), len(STRONGEST), squeeze=False)
+    for axes, count in zip(panels[0], STRONGEST, strict=True):
+        axes.set_title(f"{count} features", fontsize=10)
     for row, (scene, frame) in zip(panels, frames.items(), strict=True):
         image = read_rgb(frame.image)
         for axes, count in zip(row, STRONGEST, strict=True):
             axes.imshow(image)
             axes.plot(*frame.keypoints[:count, :2].T, ".", color="#e8000b", markersize=4, linestyle="none")
             axes.set(xticks=[], yticks=[], xlim=(0, image.shape[1]), ylim=(image.shape[0], 0))
-            axes.set_title(f"{count} features" if row is panels[0] else "", fontsize=10)
         row[0].set_ylabel(scene)
     return figure
