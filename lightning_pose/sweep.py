@@ -172,8 +172,9 @@ def _conclude(study: Study, plan: Plan, client: MlflowClient, parent: str, folde
     files, rows = show_study(study, plan, folder)
     for file in files:
         client.log_artifact(parent, str(file), "study")
-    for file in draw_figures(study, plan, folder):
-        client.log_artifact(parent, str(file), "figures")
+    if plan.measure is None:  # a study has a figure of its own
+        for file in draw_figures(study, plan, folder):
+            client.log_artifact(parent, str(file), "figures")
     for objective, value in zip(plan.objectives, best.values, strict=True):
         client.log_metric(parent, f"best/{objective.metric}", value)
     client.set_tag(parent, "sweep.best_trial", str(best.number))

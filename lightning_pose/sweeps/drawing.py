@@ -76,7 +76,6 @@ def _told(key: str, value: Any, exhibit: Exhibit) -> str:
 
 
 def _settings(axes: Axes, lines: Lines, metric: str, exhibit: Exhibit) -> None:
-    assert exhibit.x is not None, "lines and bars have one"
     places = _places(lines, exhibit)
     numeric = exhibit.kind == "line" and all(isinstance(place, float) for place in places.values())
     width = 0.8 / len(lines)
@@ -104,9 +103,8 @@ def _settings(axes: Axes, lines: Lines, metric: str, exhibit: Exhibit) -> None:
 
 def _places(lines: Lines, exhibit: Exhibit) -> dict[str, float | int]:
     """Where on the axis each value lies, by its name: numbers where they are, in a line, others in their order."""
-    values = {
-        named(cell.values.get(exhibit.x)): _plain(cell.values.get(exhibit.x)) for c in lines.values() for cell in c
-    }  # type: ignore[arg-type]
+    held = [cell.values.get(exhibit.x) for cells in lines.values() for cell in cells]
+    values = {named(value): _plain(value) for value in held}
     if exhibit.kind == "line" and all(isinstance(v, int | float) and not isinstance(v, bool) for v in values.values()):
         return {name: float(value) for name, value in values.items()}
     return {name: i for i, name in enumerate(values)}
@@ -130,8 +128,9 @@ def _thinned(ticks: list[float]) -> list[float]:
 def _curves(axes: Axes, lines: Lines, name: str, exhibit: Exhibit) -> None:
     for i, (label, cells) in enumerate(lines.items()):
         curve = cells[0].curve(name)
-        steps = {"drawstyle": "steps-post"} if name.endswith("histogram") else {"marker": "o", "markersize": 3}
-        axes.plot(list(curve), list(curve.values()), color=COLORS[i % len(COLORS)], label=label, **steps)
+        (line,) = axes.plot(list(curve), list(curve.values()), "o-", color=COLORS[i % len(COLORS)], label=label)
+        if name.endswith("histogram"):
+            line.set(drawstyle="steps-post", marker="")
     for baseline in exhibit.beside:
         curve = next(iter(lines.values()))[0].curve(name.replace("test/", f"baseline/{baseline}/"))
         color, dash = BASELINES.get(baseline, ("#8c8c8c", "--"))
@@ -145,7 +144,7 @@ def _baselines(axes: Axes, lines: Lines, metric: str, exhibit: Exhibit, places: 
         name = metric.replace("test/", f"baseline/{baseline}/")
         at: dict[float, list[float]] = {}
         for cell in (cell for cells in lines.values() for cell in cells):
-            at.setdefault(places[named(cell.values.get(exhibit.x))], []).extend(cell.all(name))  # type: ignore[arg-type]
+            at.setdefault(places[named(cell.values.get(exhibit.x))], []).extend(cell.all(name))
         drawn = {place: fmean(values) for place, values in sorted(at.items()) if values}
         if drawn and name != metric:
             color, dash = BASELINES.get(baseline, ("#8c8c8c", "--"))

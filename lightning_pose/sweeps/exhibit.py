@@ -33,7 +33,7 @@ class Exhibit:
     Attributes:
         kind: `line` or `bar` over a setting; `curve` over whatever a trial's own curves run over, one line a trial;
             `pictures` of keypoints.
-        x: the setting along the horizontal axis; None for curves and pictures.
+        x: the setting along the horizontal axis; empty for curves and pictures.
         y: metrics, or curves, one panel each.
         log: which axes are logarithmic.
         beside: baselines that are drawn with the model, by name.
@@ -43,7 +43,7 @@ class Exhibit:
     """
 
     kind: str
-    x: str | None
+    x: str
     y: tuple[str, ...]
     log: tuple[str, ...]
     beside: tuple[str, ...]
@@ -97,14 +97,14 @@ def parse_exhibit(raw: Any, measure: str | None, space: Sequence[Parameter]) -> 
     )
 
 
-def _axis(x: Any, kind: str, space: Sequence[Parameter]) -> str | None:
+def _axis(x: Any, kind: str, space: Sequence[Parameter]) -> str:
     keys = [parameter.key for parameter in space]
     if kind in ("curve", "pictures"):
         if x is not None:
             raise ConfigError(
                 f"figure.x is {x}, but a figure of kind {kind} has no setting along its axis; leave it out"
             )
-        return None
+        return ""
     name = str(x).replace(".init_args.", ".")
     if name not in keys:
         raise ConfigError(f"figure.x is {x}, which is not searched; {nearest(name, keys)}")

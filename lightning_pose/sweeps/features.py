@@ -78,7 +78,7 @@ def keypoints_of_a_frame(config: ParsedConfig) -> FrameKeypoints:
 
 
 def _datamodule(config: ParsedConfig) -> Any:
-    data = config.parser.instantiate_classes(config.config).data
+    data = config.parser.instantiate_classes(config.config)["data"]
     if not isinstance(data.extractor, LocalExtractor):
         raise ConfigError(f"{data.extractor.name} finds no keypoints; give an extractor that does, such as SURF")
     return data
