@@ -50,18 +50,39 @@ class _RunCheckpoint(ModelCheckpoint):
 class BestCheckpoint(_RunCheckpoint):
     """`best.ckpt`: the weights of the best epoch on validation frames, or of the last one where there are none.
 
+    The run keeps that epoch's validation metrics as `best/val/...`, beside `val/...` of every epoch.
+
     Args:
         monitor: the validation metric that decides; lower is better.
     """
 
     def __init__(self, monitor: str = "val/loss") -> None:
         super().__init__(monitor=monitor, filename="best", save_weights_only=True, enable_version_counter=False)
+        self._metrics: dict[str, float] = {}
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         datamodule = getattr(trainer, "datamodule", None)
         if stage == "fit" and datamodule is not None and not datamodule.val_dataloader():
             self.monitor = None
         super().setup(trainer, pl_module, stage)
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        before = self.best_model_score
+        super().on_validation_end(trainer, pl_module)
+        if self.best_model_score is not before:
+            measured = trainer.callback_metrics.items()
+            self._metrics = {f"best/{name}": float(v) for name, v in measured if name.startswith("val/")}
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._tell(trainer)
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        self._tell(trainer)
+
+    def _tell(self, trainer: Trainer) -> None:
+        logger = run_logger(trainer)
+        if logger is not None and self._metrics:
+            logger.log_metrics(self._metrics)
 
 
 class LastCheckpoint(_RunCheckpoint):

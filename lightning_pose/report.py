@@ -32,7 +32,7 @@ degrees on the test frames, and the mean over the scenes, out of the runs that `
 
 RULES = """Several runs of a system on a scene are joined by --pick:
 
-  best     the run with the lowest validation error (val/position_median_m, else val/loss, of its last epoch). Test
+  best     the run with the lowest validation error (val/position_median_m, else val/loss, of its best epoch). Test
            errors never choose. Where no run has one, the newest.
   latest   the newest run
   spread   mean and standard deviation over runs that differ in nothing but seed_everything; others are refused, or

@@ -76,6 +76,19 @@ def test_last_has_all_that_training_needs_and_best_the_weights(trained: Trained)
     assert trained.best.stat().st_size < trained.last.stat().st_size
 
 
+def test_the_run_tells_the_validation_metrics_of_its_best_epoch(workplace: Workplace) -> None:
+    assert workplace.run("fit", "--trainer.max_epochs", "4", "--model.learning_rate", "0.3") == 0
+    (run,) = workplace.runs()
+
+    def history(name: str) -> list[float]:
+        return [metric.value for metric in workplace.client.get_metric_history(run.info.run_id, name)]
+
+    losses = history("val/loss")
+    best = losses.index(min(losses))
+    assert run.data.metrics["best/val/loss"] == losses[best]
+    assert run.data.metrics["best/val/position_median_m"] == history("val/position_median_m")[best]
+
+
 def test_the_parts_work_without_the_command_line(workplace: Workplace, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(workplace.folder)
     data = ImageDataModule(Thumbnails(), root=str(workplace.scene), batch_size=8)

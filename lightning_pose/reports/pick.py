@@ -17,6 +17,7 @@ __all__ = ["PICKS", "Choice", "Pick", "pick_runs"]
 Pick = Literal["best", "latest", "spread"]
 PICKS: tuple[Pick, ...] = ("best", "latest", "spread")
 VALIDATION = ("val/position_median_m", "val/loss")
+"""Of a run's best epoch, `best/...`, or of its last where it does not tell that one."""
 
 
 @dataclass
@@ -51,14 +52,14 @@ class Choice:
         if pick == "latest":
             return "the newest run of each system and scene"
         metrics = " or ".join(self.by) or VALIDATION[0]
-        return f"of each system and scene, the run that is best by {metrics} of its last epoch; never by test errors"
+        return f"of each system and scene, the run that is best by {metrics} of its best epoch; never by test errors"
 
 
 def pick_runs(runs: Sequence[Run], pick: Pick, cell: str, choice: Choice) -> list[Run]:
     """The runs that a cell shows.
 
-    - `best`: the lowest validation error, `val/position_median_m` or else `val/loss`, never a test error. The store's
-      newest value counts, that of the last epoch. Where no run has one, the newest run.
+    - `best`: the lowest validation error, `val/position_median_m` or else `val/loss`, never a test error: that of the
+      best epoch, or of the last where a run does not tell its best. Where no run has one, the newest run.
     - `latest`: the newest run.
     - `spread`: all runs of `fit`, which may differ in nothing but the seed; of several with one seed, the newest.
 
@@ -78,17 +79,21 @@ def pick_runs(runs: Sequence[Run], pick: Pick, cell: str, choice: Choice) -> lis
 
 def _best(runs: Sequence[Run], cell: str, choice: Choice) -> Run:
     for metric in VALIDATION:
-        told = [run for run in runs if math.isfinite(run.metrics.get(metric, math.nan))]
+        told = [run for run in runs if math.isfinite(_measured(run, metric))]
         if told:
             choice.by[metric] += 1
             if len(told) < len(runs):
                 choice.passed_over.append(f"{cell} ({len(runs) - len(told)} of {len(runs)})")
             if "data.val_fraction" in differing_settings(told):
                 choice.uneven.append(cell)
-            return min(told, key=lambda run: run.metrics[metric])  # of equals the newest
+            return min(told, key=lambda run: _measured(run, metric))  # of equals the newest
     if len(runs) > 1:
         choice.unmeasured.append(cell)
     return runs[0]
+
+
+def _measured(run: Run, metric: str) -> float:
+    return run.metrics.get(f"best/{metric}", run.metrics.get(metric, math.nan))
 
 
 def _seeds(runs: Sequence[Run], cell: str, choice: Choice) -> list[Run]:

@@ -30,7 +30,7 @@ Query = Callable[[str], Iterable[Any]]
 VERBS = ("fit", "test")
 TABLES = ("experiments", "latest_metrics", "params", "runs", "tags")
 METRICS = re.compile(
-    r"(test|val|baseline/\w+)/(position_median_m|orientation_median_deg)|val/loss|test/skill_\w+|cost/\w+"
+    r"(test|(best/)?val|baseline/\w+)/(position_median_m|orientation_median_deg)|(best/)?val/loss|test/skill_\w+|cost/\w+"
 )
 """The metrics that a report reads; a run has a hundred others."""
 
@@ -48,7 +48,8 @@ _VALUES = "SELECT t.run_uuid, t.key, t.value " + _MINE.format(join="JOIN {table}
 _METRICS = (
     "SELECT t.run_uuid, t.key, t.value, t.is_nan "
     + _MINE.format(join="JOIN latest_metrics t ON t.run_uuid = r.run_uuid")
-    + " AND (t.key LIKE 'test/%' OR t.key LIKE 'val/%' OR t.key LIKE 'cost/%' OR t.key LIKE 'baseline/%_median_%')"
+    + " AND (t.key LIKE 'test/%' OR t.key LIKE 'val/%' OR t.key LIKE 'best/val/%' OR t.key LIKE 'cost/%'"
+    + " OR t.key LIKE 'baseline/%_median_%')"
 )
 _STATES = """SELECT v.value, r.status, r.lifecycle_stage FROM runs r
 LEFT JOIN tags v ON v.run_uuid = r.run_uuid AND v.key = 'verb'"""

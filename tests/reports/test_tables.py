@@ -54,6 +54,14 @@ def test_best_is_by_validation_and_never_by_test(table) -> None:
     assert any("SurfLSTM on chess (1 of 3): runs without a validation metric" in note for note in report.notes)
 
 
+def test_best_is_by_the_best_epoch_where_a_run_tells_it(table) -> None:
+    report = table(
+        FakeRun(test=(0.1, 1.0), val=0.2, day=1),
+        FakeRun(test=(0.9, 9.0), val=0.5, metrics={"best/val/position_median_m": 0.1}, day=2),
+    )
+    assert shown(report) == {"SurfLSTM": {"chess": 0.9}}
+
+
 def test_best_falls_back_to_the_loss_and_then_to_the_newest(table) -> None:
     by_loss = table(
         FakeRun(test=(0.1, 1.0), val=None, metrics={"val/loss": 2.0}, day=3),
