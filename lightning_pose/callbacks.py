@@ -11,6 +11,7 @@ from typing import Any
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint, Timer
 from lightning.pytorch.utilities.exceptions import SIGTERMException
+from torch import Tensor
 
 from lightning_pose.errors import ImageError
 from lightning_pose.images import read_gray
@@ -69,6 +70,14 @@ class BestCheckpoint(_RunCheckpoint):
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         before = self.best_model_score
         super().on_validation_end(trainer, pl_module)
+        self._remember(trainer, before)
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        before = self.best_model_score
+        super().on_train_epoch_end(trainer, pl_module)
+        self._remember(trainer, before)
+
+    def _remember(self, trainer: Trainer, before: Tensor | None) -> None:
         if self.best_model_score is not before:
             measured = trainer.callback_metrics.items()
             self._metrics = {f"best/{name}": float(v) for name, v in measured if name.startswith("val/")}
