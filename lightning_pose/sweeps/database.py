@@ -26,7 +26,7 @@ from lightning_pose.errors import ConfigError
 __all__ = ["alone", "connect", "shown"]
 
 HEARTBEAT_SECONDS, GRACE_SECONDS = 15, 60
-PATIENCE_SECONDS = 60
+PATIENCE_SECONDS = 30
 DRIVERS = {"postgres": "postgresql", "postgresql": "postgresql+psycopg"}
 
 
@@ -43,7 +43,7 @@ def connect(url: str, silent: Callable[[Study, FrozenTrial], None]) -> RDBStorag
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     warnings.filterwarnings("ignore", category=ExperimentalWarning)
     address = _address(url)
-    if address.database and address.drivername.startswith("sqlite"):
+    if address.database and address.get_backend_name() == "sqlite":
         Path(address.database).parent.mkdir(parents=True, exist_ok=True)
     try:
         for _ in range(3):
@@ -62,9 +62,10 @@ def connect(url: str, silent: Callable[[Study, FrozenTrial], None]) -> RDBStorag
         ) from error
     except (SQLAlchemyError, RuntimeError, OSError) as error:
         told = str(getattr(error, "orig", None) or error).splitlines()[0]
-        raise ConfigError(
-            f"--storage {shown(url)} cannot be used ({told}); check the address, such as sqlite:///DIR/optuna.db"
-        ) from error
+        remedy = "check the address, and that the server runs and has the database"
+        if address.get_backend_name() == "sqlite":
+            remedy = "give an address such as sqlite:///DIR/optuna.db"
+        raise ConfigError(f"--storage {shown(url)} cannot be used ({told}); {remedy}") from error
 
 
 def _address(url: str) -> URL:
@@ -87,10 +88,13 @@ def _address(url: str) -> URL:
 
 
 def _open(address: URL, silent: Callable[[Study, FrozenTrial], None]) -> RDBStorage:
-    local = address.drivername.startswith("sqlite")
+    if address.get_backend_name() == "sqlite":
+        engine = {"connect_args": {"timeout": 2 * PATIENCE_SECONDS}}
+    else:
+        engine = {"pool_pre_ping": True, "connect_args": {"connect_timeout": PATIENCE_SECONDS} | dict(address.query)}
     return RDBStorage(
         address.render_as_string(hide_password=False),
-        engine_kwargs={"connect_args": {"timeout": PATIENCE_SECONDS}} if local else {"pool_pre_ping": True},
+        engine_kwargs=engine,
         heartbeat_interval=HEARTBEAT_SECONDS,
         grace_period=GRACE_SECONDS,
         heartbeat_stale_trial_callback=silent,

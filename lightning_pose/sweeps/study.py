@@ -19,7 +19,7 @@ from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
 from lightning_pose.errors import ConfigError
-from lightning_pose.sweeps.database import connect
+from lightning_pose.sweeps.database import alone, connect
 from lightning_pose.sweeps.plan import Plan
 from lightning_pose.sweeps.record import close_run
 from lightning_pose.sweeps.space import grid, nearest
@@ -39,6 +39,7 @@ __all__ = [
 
 RETRIES = 3
 CELL = "grid_cell"
+SEEDS = "samplers"  # how many there have been
 
 SAMPLERS: dict[str, Callable[..., samplers.BaseSampler]] = {
     "tpe": samplers.TPESampler,
@@ -105,11 +106,13 @@ def open_study(plan: Plan, name: str, storage: RDBStorage) -> Study:
     return study
 
 
-def attach(plan: Plan, name: str, storage: RDBStorage, worker: int = 0) -> Study:
-    """The study as one worker sees it: with a sampler that draws what no other worker and no earlier command drew."""
+def attach(plan: Plan, name: str, storage: RDBStorage) -> Study:
+    """The study as one worker sees it: with a sampler that draws what no other worker and no other command draws."""
     study = optuna.load_study(study_name=name, storage=storage)
-    drawn = len(study.get_trials(deepcopy=False))
-    study.sampler = _sampler(plan, seed=plan.seed + drawn + 100_003 * worker)
+    with alone(storage, name):
+        number = study.user_attrs.get(SEEDS, 0)
+        study.set_user_attr(SEEDS, number + 1)
+    study.sampler = _sampler(plan, seed=plan.seed + number)
     study.pruner = _pruner(plan)
     return study
 
@@ -138,6 +141,8 @@ def _sampler(plan: Plan, seed: int | None = None) -> samplers.BaseSampler:
     if name == "cmaes" and find_spec("cmaes") is None:  # Optuna would find out in the middle of the sweep
         raise ConfigError("sampler cmaes needs the package cmaes; `uv pip install cmaes` installs it, or take tpe")
     options: dict[str, Any] = {"seed": plan.seed if seed is None else seed}
+    if name == "qmc":
+        options["seed"] = plan.seed  # all workers take their points from one sequence, which the study counts
     if name == "tpe":
         options["constant_liar"] = True  # workers keep away from what others are trying
     if name == "cmaes":

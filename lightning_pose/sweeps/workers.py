@@ -57,9 +57,9 @@ class Job:
         """The study's database, by connections of this process's own."""
         return open_storage(self.storage, self.plan.tracking[0])
 
-    def open(self, storage: RDBStorage, worker: int = 0) -> Study:
+    def open(self, storage: RDBStorage) -> Study:
         """The study, with a sampler of this worker's own."""
-        return attach(self.plan, self.study, storage, worker)
+        return attach(self.plan, self.study, storage)
 
 
 def run_alone(job: Job, total: int, finished: Finished) -> None:
@@ -114,11 +114,11 @@ def _own_failed(study: Study) -> FrozenTrial | None:
     return own[-1] if own and own[-1].state == TrialState.FAIL else None
 
 
-def _work(job: Job, worker: int, orders: Connection) -> None:
+def _work(job: Job, orders: Connection) -> None:
     """A worker process: one trial for each order, until there are none."""
     try:
         storage = job.connect()
-        study = job.open(storage, worker)
+        study = job.open(storage)
         while orders.recv():
             ran = _run_one(study, storage, job, partial(_send, orders))
             orders.send("done" if ran else "none")
@@ -153,13 +153,12 @@ def run_together(job: Job, total: int, finished: Finished, workers: int) -> None
     context = _context(workers)
     storage = job.connect()
     study = job.open(storage)
-    left, started = total, 0
+    left = total
     crew: list[_Worker] = []
     try:
         while left > 0 or any(worker.busy for worker in crew):
             while len(crew) < min(workers, left + sum(worker.busy for worker in crew)):
-                started += 1
-                crew.append(_start(context, job, started))
+                crew.append(_start(context, job))
             for worker in crew:
                 if not worker.busy and left > 0 and _order(worker):
                     left -= 1
@@ -206,9 +205,9 @@ def _context(workers: int) -> Any:
     return context
 
 
-def _start(context: Any, job: Job, number: int) -> _Worker:
+def _start(context: Any, job: Job) -> _Worker:
     ours, theirs = context.Pipe()
-    process = context.Process(target=_work, args=(job, number, theirs))
+    process = context.Process(target=_work, args=(job, theirs))
     process.start()
     theirs.close()  # so that the pipe breaks when the worker dies
     return _Worker(process, ours)
