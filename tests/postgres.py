@@ -58,7 +58,7 @@ def _programs() -> Path:
     return found[-1].parent if found else Path(str(named)).parent
 
 
-def _user() -> str | int | None:
+def _user() -> int | None:
     """Who runs the server, which refuses to be root; None for the user of the tests."""
     if os.geteuid() != 0:
         return None
@@ -71,7 +71,7 @@ def _user() -> str | int | None:
 
 
 @contextmanager
-def _running(programs: Path, folder: Path, user: str | int | None) -> Iterator[int]:
+def _running(programs: Path, folder: Path, user: int | None) -> Iterator[int]:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]

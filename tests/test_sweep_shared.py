@@ -205,7 +205,7 @@ def test_the_dashboard_shows_a_study(workplace: Workplace) -> None:
             shown = json.loads(fetch(f"{page}/api/studies/{study['study_id']}?after=0", server))
             assert [trial["state"] for trial in shown["trials"]] == ["Complete", "Complete"]
             assert [t["values"][0] for t in shown["trials"]] == [t.value for t in load(workplace).trials]
-            assert shown["metric_names"] == ["val/loss"]
+            assert shown["objective_names"] == ["val/loss"]
             assert {p["name"] for p in shown["trials"][0]["params"]} == SPACE.keys()
         finally:
             server.terminate()

@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import re
 import sqlite3
-import time
 import warnings
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import optuna
 from optuna import Study
-from optuna.exceptions import ExperimentalWarning
+from optuna.exceptions import ExperimentalWarning, OptunaError
 from optuna.storages import RDBStorage
 from optuna.trial import FrozenTrial
-from sqlalchemy import func, select
-from sqlalchemy.engine import URL, make_url
-from sqlalchemy.exc import ArgumentError, IntegrityError, OperationalError, ProgrammingError, SQLAlchemyError
+from sqlalchemy import create_engine, func, select
+from sqlalchemy.engine import URL, Engine, make_url
+from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 
 from lightning_pose.errors import ConfigError
 
@@ -46,21 +46,17 @@ def connect(url: str, silent: Callable[[Study, FrozenTrial], None]) -> RDBStorag
     if address.database and address.get_backend_name() == "sqlite":
         Path(address.database).parent.mkdir(parents=True, exist_ok=True)
     try:
-        for _ in range(3):
-            try:
+        gate = create_engine(address, **_patience(address))
+        try:
+            with _locked(gate, 0):  # or two commands would make the same tables
                 return _open(address, silent)
-            except (IntegrityError, ProgrammingError):
-                time.sleep(1)  # another command is making the same tables
-            except OperationalError as error:
-                if "already exists" not in str(error):
-                    raise
-                time.sleep(1)
-        return _open(address, silent)
+        finally:
+            gate.dispose()
     except ImportError as error:
         raise ConfigError(
-            f"--storage {shown(url)} needs a database driver ({error.__cause__}); `uv sync --extra sweep` installs it"
+            f"--storage {shown(url)} needs a database driver ({error.__cause__ or error}); `uv sync --extra sweep` installs it"
         ) from error
-    except (SQLAlchemyError, RuntimeError, OSError) as error:
+    except (SQLAlchemyError, OptunaError, RuntimeError, OSError, sqlite3.Error) as error:
         told = str(getattr(error, "orig", None) or error).splitlines()[0]
         remedy = "check the address, and that the server runs and has the database"
         if address.get_backend_name() == "sqlite":
@@ -88,17 +84,22 @@ def _address(url: str) -> URL:
 
 
 def _open(address: URL, silent: Callable[[Study, FrozenTrial], None]) -> RDBStorage:
-    if address.get_backend_name() == "sqlite":
-        engine = {"connect_args": {"timeout": 2 * PATIENCE_SECONDS}}
-    else:
-        engine = {"pool_pre_ping": True, "connect_args": {"connect_timeout": PATIENCE_SECONDS} | dict(address.query)}
     return RDBStorage(
         address.render_as_string(hide_password=False),
-        engine_kwargs=engine,
+        engine_kwargs=_patience(address),
         heartbeat_interval=HEARTBEAT_SECONDS,
         grace_period=GRACE_SECONDS,
         heartbeat_stale_trial_callback=silent,
     )
+
+
+def _patience(address: URL) -> dict[str, Any]:
+    """How long an engine waits: for other writers of a file, and for a server's answer."""
+    if address.get_backend_name() == "sqlite":
+        return {"connect_args": {"timeout": 2 * PATIENCE_SECONDS}}
+    connect = {} if "connect_timeout" in address.query else {"connect_timeout": PATIENCE_SECONDS}
+    # A server has 100 connections by default: each of many workers keeps but one while it has no need of more.
+    return {"pool_pre_ping": True, "pool_size": 1, "max_overflow": 9, "connect_args": connect}
 
 
 def shown(url: str) -> str:
@@ -118,13 +119,19 @@ def alone(storage: RDBStorage, study: str) -> Iterator[None]:
         storage: of `connect`.
         study: name.
     """
-    if storage.engine.dialect.name == "postgresql":
-        with storage.engine.begin() as connection:
-            connection.execute(select(func.pg_advisory_xact_lock(zlib.crc32(study.encode()))))
+    with _locked(storage.engine, 1 + zlib.crc32(study.encode())):
+        yield
+
+
+@contextmanager
+def _locked(engine: Engine, key: int) -> Iterator[None]:
+    if engine.dialect.name == "postgresql":
+        with engine.begin() as connection:
+            connection.execute(select(func.pg_advisory_xact_lock(key)))
             yield
         return
     # A database of its own, because a locked one could not be written to by the holder's other connections.
-    with closing(sqlite3.connect(f"{storage.engine.url.database}-lock", timeout=1, isolation_level=None)) as lock:
+    with closing(sqlite3.connect(f"{engine.url.database}-lock", timeout=1, isolation_level=None)) as lock:
         while True:
             try:
                 lock.execute("BEGIN EXCLUSIVE")
