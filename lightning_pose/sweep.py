@@ -79,30 +79,25 @@ def main(argv: list[str]) -> int:
     own, overrides = _split(argv)
     args = _parser().parse_args(own)
     # Only now, so that `--help` is there at once.
+    from lightning_pose.sweeps.database import alone, shown
     from lightning_pose.sweeps.plan import read_plan
     from lightning_pose.sweeps.record import open_parent
-    from lightning_pose.sweeps.study import (
-        enqueue_grid,
-        is_grid,
-        open_storage,
-        open_study,
-        recover,
-        shown,
-        waiting,
-    )
+    from lightning_pose.sweeps.study import enqueue_grid, is_grid, open_storage, open_study, recover, waiting
     from lightning_pose.sweeps.workers import Job
 
     plan = read_plan(args.file, overrides)
     name = args.study or f"{args.file.stem}-{plan.scene}"
-    storage = open_storage(args.storage)
-    study = open_study(plan, name, storage)
-    client, parent = open_parent(study, plan)
-    status = "KILLED"
-    try:
+    storage = open_storage(args.storage, plan.tracking[0])
+    with alone(storage, name):
+        study = open_study(plan, name, storage)
+        client, parent = open_parent(study, plan)
         recover(study, storage, client)
-        total = args.n_trials if args.n_trials is not None else plan.n_trials
         if is_grid(plan):
             enqueue_grid(study, plan)
+    status = "KILLED"
+    try:
+        total = args.n_trials if args.n_trials is not None else plan.n_trials
+        if is_grid(plan):
             total = waiting(study) if total is None else min(total, waiting(study))
         _run(study, plan, Job(plan, name, args.storage, parent), N_TRIALS if total is None else total, args.workers)
         _conclude(study, plan, client, parent, args.out or Path("mlruns") / "sweeps" / name)

@@ -18,8 +18,8 @@ import yaml
 from mlflow.entities import Run
 from optuna.trial import TrialState
 
+from lightning_pose.sweeps.database import shown
 from lightning_pose.sweeps.plan import read_plan
-from lightning_pose.sweeps.study import shown
 from tests.helpers import REPOSITORY, Workplace
 
 CONFIGS = sorted((REPOSITORY / "configs").glob("*.yaml"))

@@ -64,11 +64,11 @@ def _cell(value: object) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def close_run(client: MlflowClient, run: str | None) -> None:
-    """Mark the run of a trial whose process died; None where it had none yet."""
+def close_run(client: MlflowClient, run: str | None, reason: str) -> None:
+    """Mark the run of a trial whose process is gone; None where it had none yet."""
     if run is not None and _exists(client, run):
         client.set_tag(run, "sweep.state", "FAILED")
-        client.set_tag(run, "sweep.reason", "its process died")
+        client.set_tag(run, "sweep.reason", reason)
         client.set_terminated(run, "KILLED")
 
 

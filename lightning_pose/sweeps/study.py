@@ -4,24 +4,22 @@ from __future__ import annotations
 
 import json
 import socket
-import time
-import warnings
+import sys
 from collections.abc import Callable, Mapping
+from functools import partial
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
 
 import optuna
 from mlflow import MlflowClient
 from optuna import Study, pruners, samplers
-from optuna.exceptions import ExperimentalWarning, UpdateFinishedTrialError
-from optuna.storages import RDBStorage, RetryHeartbeatStaleTrialCallback
+from optuna.exceptions import UpdateFinishedTrialError
+from optuna.storages import RDBStorage, RetryHeartbeatStaleTrialCallback, fail_stale_trials
 from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState
-from sqlalchemy.engine import make_url
-from sqlalchemy.exc import ArgumentError, IntegrityError, OperationalError, SQLAlchemyError
 
 from lightning_pose.errors import ConfigError
+from lightning_pose.sweeps.database import alone, connect
 from lightning_pose.sweeps.plan import Plan
 from lightning_pose.sweeps.record import close_run
 from lightning_pose.sweeps.space import grid, nearest
@@ -36,19 +34,18 @@ __all__ = [
     "open_study",
     "queue_again",
     "recover",
-    "shown",
     "waiting",
 ]
 
-HEARTBEAT_SECONDS, GRACE_SECONDS = 15, 60
 RETRIES = 3
 CELL = "grid_cell"
+SEEDS = "samplers"  # how many there have been
 
 SAMPLERS: dict[str, Callable[..., samplers.BaseSampler]] = {
     "tpe": samplers.TPESampler,
     "gp": samplers.GPSampler,
     "random": samplers.RandomSampler,
-    "grid": samplers.RandomSampler,  # its cells wait in the study, where no two workers can take the same one
+    "grid": samplers.RandomSampler,  # its cells wait in the study, and nothing else is ever drawn
     "cmaes": samplers.CmaEsSampler,
     "nsga2": samplers.NSGAIISampler,
     "nsga3": samplers.NSGAIIISampler,
@@ -70,48 +67,17 @@ def is_grid(plan: Plan) -> bool:
     return _plain(plan.sampler["name"]) == "grid"
 
 
-def open_storage(url: str) -> RDBStorage:
+def open_storage(url: str, tracking: str) -> RDBStorage:
     """Connect to Optuna's database; a trial whose process falls silent is failed and queued again.
+
+    Args:
+        url: of the database.
+        tracking: MLflow's address, where the trials' runs are.
 
     Raises:
         ConfigError: the database cannot be reached or read.
     """
-    optuna.logging.set_verbosity(optuna.logging.ERROR)
-    warnings.filterwarnings("ignore", category=ExperimentalWarning)
-    if url.startswith("sqlite:///"):
-        Path(url.removeprefix("sqlite:///")).parent.mkdir(parents=True, exist_ok=True)
-    try:
-        try:
-            return _connect(url)
-        except (IntegrityError, OperationalError):
-            time.sleep(1)  # another command may be making the same tables
-            return _connect(url)
-    except ImportError as error:
-        raise ConfigError(f"--storage {shown(url)} needs a database driver ({error.__cause__}); install it") from error
-    except (SQLAlchemyError, RuntimeError, OSError) as error:
-        told = str(error).splitlines()[0]
-        raise ConfigError(
-            f"--storage {shown(url)} cannot be used ({told}); give an address such as sqlite:///DIR/optuna.db"
-        ) from error
-
-
-def _connect(url: str) -> RDBStorage:
-    patience = {"connect_args": {"timeout": 60}} if url.startswith("sqlite") else {"pool_pre_ping": True}
-    return RDBStorage(
-        url,
-        engine_kwargs=patience,
-        heartbeat_interval=HEARTBEAT_SECONDS,
-        grace_period=GRACE_SECONDS,
-        heartbeat_stale_trial_callback=_retry,
-    )
-
-
-def shown(url: str) -> str:
-    """A database's address without its password."""
-    try:
-        return make_url(url).render_as_string(hide_password=True)
-    except ArgumentError:
-        return url
+    return connect(url, partial(_fell_silent, tracking))
 
 
 def open_study(plan: Plan, name: str, storage: RDBStorage) -> Study:
@@ -140,11 +106,13 @@ def open_study(plan: Plan, name: str, storage: RDBStorage) -> Study:
     return study
 
 
-def attach(plan: Plan, name: str, storage: RDBStorage, worker: int = 0) -> Study:
-    """The study as one worker sees it: with a sampler that draws what no other worker and no earlier command drew."""
+def attach(plan: Plan, name: str, storage: RDBStorage) -> Study:
+    """The study as one worker sees it: with a sampler that draws what no other worker and no other command draws."""
     study = optuna.load_study(study_name=name, storage=storage)
-    drawn = len(study.get_trials(deepcopy=False))
-    study.sampler = _sampler(plan, seed=plan.seed + drawn + 100_003 * worker)
+    with alone(storage, name):
+        number = study.user_attrs.get(SEEDS, 0)
+        study.set_user_attr(SEEDS, number + 1)
+    study.sampler = _sampler(plan, seed=plan.seed + number)
     study.pruner = _pruner(plan)
     return study
 
@@ -173,6 +141,8 @@ def _sampler(plan: Plan, seed: int | None = None) -> samplers.BaseSampler:
     if name == "cmaes" and find_spec("cmaes") is None:  # Optuna would find out in the middle of the sweep
         raise ConfigError("sampler cmaes needs the package cmaes; `uv pip install cmaes` installs it, or take tpe")
     options: dict[str, Any] = {"seed": plan.seed if seed is None else seed}
+    if name == "qmc":
+        options["seed"] = plan.seed  # all workers take their points from one sequence, which the study counts
     if name == "tpe":
         options["constant_liar"] = True  # workers keep away from what others are trying
     if name == "cmaes":
@@ -204,7 +174,10 @@ def _build(kind: Callable[..., Any], options: Mapping[str, Any], what: str) -> A
 
 
 def enqueue_grid(study: Study, plan: Plan) -> None:
-    """Let every cell of the grid wait in the study that is not in it yet, whatever became of it."""
+    """Let every cell of the grid wait in the study that is not in it yet, whatever became of it.
+
+    The caller keeps others out (`alone`), or two commands would queue the same cell.
+    """
     there = {trial.user_attrs.get(CELL) for trial in study.get_trials(deepcopy=False)}
     for cell in grid(plan.space, plan.seed):
         name = json.dumps(cell, sort_keys=True)
@@ -217,37 +190,66 @@ def waiting(study: Study) -> int:
     return len(study.get_trials(deepcopy=False, states=(TrialState.WAITING,)))
 
 
-def _retry(study: Study, trial: FrozenTrial, limit: int | None = RETRIES) -> None:
-    """Queue a trial again that was no failure of its own; what kills its process every time has an end."""
-    trial.user_attrs = {k: v for k, v in trial.user_attrs.items() if k not in (PROCESS, REASON, RUN)}
-    RetryHeartbeatStaleTrialCallback(max_retry=limit)(study, trial)
-
-
-def queue_again(study: Study, number: int, limit: int | None = RETRIES) -> bool:
-    """Queue a trial again that was interrupted or whose process died; False where that happened too often."""
-    before = len(study.get_trials(deepcopy=False))
-    trial = next(t for t in study.get_trials() if t.number == number)
-    _retry(study, trial, limit)
-    return len(study.get_trials(deepcopy=False)) > before
-
-
-def recover(study: Study, storage: RDBStorage, client: MlflowClient) -> int:
-    """Fail the trials of this machine whose process is gone, without waiting for their hearts to stop, and queue them
-    again.
+def _retry(study: Study, trial: FrozenTrial, limit: int | None = RETRIES) -> int | None:
+    """Queue a trial again that was no failure of its own; what kills its process every time has an end.
 
     Returns:
-        How many were queued.
+        The number that it waits under, None where it happened too often.
     """
-    queued = 0
+    trial.user_attrs = {k: v for k, v in trial.user_attrs.items() if k not in (PROCESS, REASON, RUN)}
+    known = {t.number for t in study.get_trials(deepcopy=False)}
+    RetryHeartbeatStaleTrialCallback(max_retry=limit)(study, trial)
+    for queued in study.get_trials(deepcopy=False):
+        if queued.number not in known and queued.system_attrs.get("retry_history", [])[-1:] == [trial.number]:
+            return queued.number
+    return None
+
+
+def queue_again(study: Study, number: int, limit: int | None = RETRIES) -> int | None:
+    """Queue a trial again that was interrupted or whose process died.
+
+    Returns:
+        The number that it waits under, None where it happened too often.
+    """
+    return _retry(study, next(t for t in study.get_trials() if t.number == number), limit)
+
+
+def _fell_silent(tracking: str, study: Study, trial: FrozenTrial) -> None:
+    """Queue a trial again, of whatever machine, that Optuna has failed because its heart stopped."""
+    run = trial.user_attrs.get(RUN)
+    _tell(trial.number, "fell silent", _retry(study, trial))
+    close_run(MlflowClient(tracking), run, "its process fell silent")
+
+
+def _tell(number: int, what: str, queued: int | None) -> None:
+    end = "it is given up" if queued is None else f"it is run again as trial {queued}"
+    print(f"the process of trial {number} {what}; {end}", file=sys.stderr, flush=True)
+
+
+def recover(study: Study, storage: RDBStorage, client: MlflowClient) -> set[int]:
+    """Fail the trials of this machine whose process is gone, without waiting for their hearts to stop, and those of
+    any machine whose heart has stopped; queue them again.
+
+    The caller keeps others out (`alone`): a trial under way that no process calls its own is then one whose process
+    died as it took it.
+
+    Returns:
+        The numbers of this machine's trials that were queued again.
+    """
+    queued = set()
     for trial in study.get_trials(states=(TrialState.RUNNING,)):
         host, _, process = trial.user_attrs.get(PROCESS, "").rpartition(":")
-        if host != socket.gethostname() or alive(int(process)):
+        if process and (host != socket.gethostname() or alive(int(process))):
             continue
         try:
             storage.set_trial_user_attr(trial._trial_id, REASON, "its process died")
             storage.set_trial_state_values(trial._trial_id, TrialState.FAIL)
         except UpdateFinishedTrialError:
-            continue  # another worker was faster
-        close_run(client, trial.user_attrs.get(RUN))
-        queued += queue_again(study, trial.number)
+            continue  # it ended in this moment
+        number = queue_again(study, trial.number)
+        _tell(trial.number, "died", number)
+        if number is not None:
+            queued.add(trial.number)
+        close_run(client, trial.user_attrs.get(RUN), "its process died")
+    fail_stale_trials(study)
     return queued

@@ -7,23 +7,29 @@ import multiprocessing
 import os
 import signal
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
 import optuna
 from mlflow import MlflowClient
 from optuna import Study
+from optuna.exceptions import UpdateFinishedTrialError
+from optuna.storages import RDBStorage, fail_stale_trials
 from optuna.trial import FrozenTrial, TrialState
 
+from lightning_pose.sweeps.database import alone
 from lightning_pose.sweeps.plan import Plan
-from lightning_pose.sweeps.study import attach, open_storage, queue_again, recover
+from lightning_pose.sweeps.study import attach, is_grid, open_storage, queue_again, recover, waiting
 from lightning_pose.sweeps.trial import PROCESS, process_name, run_trial
 
 __all__ = ["Job", "run_alone", "run_together"]
 
 PATIENCE_SECONDS = 20.0
 Finished = Callable[[], None]
+Taken = Callable[[int], None]
 
 
 @dataclass(frozen=True)
@@ -47,57 +53,85 @@ class Job:
         """Of the store that has the trials' runs."""
         return MlflowClient(self.plan.tracking[0])
 
-    def open(self, worker: int = 0) -> Study:
+    def connect(self) -> RDBStorage:
+        """The study's database, by connections of this process's own."""
+        return open_storage(self.storage, self.plan.tracking[0])
+
+    def open(self, storage: RDBStorage) -> Study:
         """The study, with a sampler of this worker's own."""
-        return attach(self.plan, self.study, open_storage(self.storage), worker)
+        return attach(self.plan, self.study, storage)
 
 
 def run_alone(job: Job, total: int, finished: Finished) -> None:
-    """Run this many trials here, one after the other.
+    """Run this many trials here, one after the other; fewer where a grid has no more.
 
     Raises:
         KeyboardInterrupt: Ctrl-C; the trial under way is queued again.
     """
-    study = job.open()
+    storage = job.connect()
+    study = job.open(storage)
     for _ in range(total):
-        _run_one(study, job)
+        if not _run_one(study, storage, job):
+            return
         finished()
 
 
-def _run_one(study: Study, job: Job) -> None:
-    """One trial; what goes wrong in it is its own affair."""
+def _run_one(study: Study, storage: RDBStorage, job: Job, taken: Taken = lambda number: None) -> bool:
+    """One trial; what goes wrong in it is its own affair. False where the study's grid has none left.
 
-    def objective(trial: optuna.Trial) -> float | list[float]:
-        return run_trial(trial, job.plan, job.parent)
+    One process at a time takes a trial, so that each is taken once, and writes down that it is its own.
+    """
+    with ExitStack() as held:
 
-    try:
-        study.optimize(objective, n_trials=1, catch=(Exception,), gc_after_trial=True)
-    except KeyboardInterrupt:
-        own = _own_interrupted(study)
-        if own is not None:
-            queue_again(study, own.number, limit=None)
-        raise
+        def objective(trial: optuna.Trial) -> float | list[float]:
+            trial.set_user_attr(PROCESS, process_name())
+            held.close()
+            taken(trial.number)
+            return run_trial(trial, job.plan, job.parent)
+
+        held.enter_context(alone(storage, job.study))
+        if is_grid(job.plan):
+            fail_stale_trials(study)  # what another machine has left undone is to be done too
+            if waiting(study) == 0:
+                return False
+        try:
+            study.optimize(objective, n_trials=1, catch=(Exception,), gc_after_trial=True)
+        except KeyboardInterrupt:
+            own = _own_failed(study)
+            if own is not None:
+                queue_again(study, own.number, limit=None)
+            raise
+        except (AssertionError, ValueError, UpdateFinishedTrialError):
+            # Optuna's answer to a result that comes too late, as after this machine slept.
+            if _own_failed(study) is None:
+                raise
+    return True
 
 
-def _own_interrupted(study: Study) -> FrozenTrial | None:
+def _own_failed(study: Study) -> FrozenTrial | None:
     """The last trial of this process, if it has just failed."""
     own = [t for t in study.get_trials(deepcopy=False) if t.user_attrs.get(PROCESS) == process_name()]
     return own[-1] if own and own[-1].state == TrialState.FAIL else None
 
 
-def _work(job: Job, worker: int, orders: Connection) -> None:
+def _work(job: Job, orders: Connection) -> None:
     """A worker process: one trial for each order, until there are none."""
     try:
-        study = job.open(worker)
+        storage = job.connect()
+        study = job.open(storage)
         while orders.recv():
-            _run_one(study, job)
-            orders.send("done")
+            ran = _run_one(study, storage, job, partial(_send, orders))
+            orders.send("done" if ran else "none")
     except KeyboardInterrupt:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second one would only spoil the exit
-        with contextlib.suppress(OSError):
-            orders.send("again")
-    except EOFError:
+        _send(orders, "again")
+    except (EOFError, BrokenPipeError, ConnectionResetError):
         pass  # the one who gives orders is gone
+
+
+def _send(orders: Connection, news: str | int) -> None:
+    with contextlib.suppress(OSError):  # a trial is worth its end, even if nobody waits for it
+        orders.send(news)
 
 
 @dataclass
@@ -105,6 +139,7 @@ class _Worker:
     process: Any
     orders: Connection
     busy: bool = False
+    trial: int | None = None
 
 
 def run_together(job: Job, total: int, finished: Finished, workers: int) -> None:
@@ -116,30 +151,36 @@ def run_together(job: Job, total: int, finished: Finished, workers: int) -> None
         KeyboardInterrupt: Ctrl-C; trials under way are queued again.
     """
     context = _context(workers)
-    study, storage = job.open(), open_storage(job.storage)
-    left, done, started = total, 0, 0
+    storage = job.connect()
+    study = job.open(storage)
+    left = total
     crew: list[_Worker] = []
     try:
-        while done < total:
+        while left > 0 or any(worker.busy for worker in crew):
             while len(crew) < min(workers, left + sum(worker.busy for worker in crew)):
-                started += 1
-                crew.append(_start(context, job, started))
+                crew.append(_start(context, job))
             for worker in crew:
                 if not worker.busy and left > 0 and _order(worker):
                     left -= 1
             for worker in _heard(crew):
                 news = _report(worker)
+                if isinstance(news, int):
+                    worker.trial = news
+                    continue
                 again = news == "again"
                 if news == "dead":
                     crew.remove(worker)
                     _check_killed(worker)
-                    again = recover(study, storage, job.client) > 0
-                if worker.busy and again:
+                    with alone(storage, job.study):
+                        queued = recover(study, storage, job.client)
+                    again = worker.trial is None or worker.trial in queued
+                if news == "none":
+                    left = 0  # other commands have taken the rest
+                elif worker.busy and again:
                     left += 1
                 elif worker.busy:
-                    done += 1
                     finished()
-                worker.busy = False
+                worker.busy, worker.trial = False, None
     except KeyboardInterrupt:
         _stop(crew)
         raise
@@ -164,9 +205,9 @@ def _context(workers: int) -> Any:
     return context
 
 
-def _start(context: Any, job: Job, number: int) -> _Worker:
+def _start(context: Any, job: Job) -> _Worker:
     ours, theirs = context.Pipe()
-    process = context.Process(target=_work, args=(job, number, theirs))
+    process = context.Process(target=_work, args=(job, theirs))
     process.start()
     theirs.close()  # so that the pipe breaks when the worker dies
     return _Worker(process, ours)
@@ -186,8 +227,10 @@ def _heard(crew: list[_Worker]) -> list[_Worker]:
     return [worker for worker in crew if worker.orders in ready]
 
 
-def _report(worker: _Worker) -> str:
-    """What a worker says of its trial: `done`, or `again` where it was interrupted; `dead` if it is."""
+def _report(worker: _Worker) -> str | int:
+    """What a worker says: the number of the trial it has taken; then `done`, or `again` where it was interrupted, or
+    `none` where a grid has no more; `dead` if it is.
+    """
     try:
         return worker.orders.recv()
     except (EOFError, OSError):
