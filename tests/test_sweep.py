@@ -201,12 +201,15 @@ def test_workers_share_a_study_and_one_may_die(
     workplace: Workplace, sweep_file: Sweep, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Exactly the cells of the grid, each once, although a worker is killed in the middle of a trial."""
-    file = sweep_file(sampler="grid", space={"model.units": [4, 5, 6]})
+    long = {"trainer.max_epochs": 10}  # enough for a busy machine to see a trial under way
+    file = sweep_file(sampler="grid", space={"model.units": [4, 5, 6]}, settings=long, pruner="none")
     with ThreadPoolExecutor() as pool:
         killer = pool.submit(_kill_worker, workplace)
         assert workplace.command("sweep", file, "--workers", "2") == 0
         killer.result()
-    assert "trial 3/3" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert "trial 3/3" in told
+    assert re.search(r"^the process of trial \d died; it is run again as trial 3$", told, re.MULTILINE)
     complete = [trial for trial in trials(workplace) if trial.state == TrialState.COMPLETE]
     (dead,) = (trial for trial in trials(workplace) if trial.state != TrialState.COMPLETE)
     assert sorted(trial.params["model.units"] for trial in complete) == [4, 5, 6]

@@ -43,7 +43,7 @@ def sweep(workplace: Workplace, database: str) -> list[str]:
     """A command that runs one trial more."""
     space = {"model.units": {"type": "int", "low": 4, "high": 40}}
     file = workplace.folder / "units.yaml"
-    entries = {"base": "tiny.yaml", "settings": {"trainer.max_epochs": 3}, "pruner": "none", "space": space}
+    entries = {"base": "tiny.yaml", "settings": {"trainer.max_epochs": 8}, "pruner": "none", "space": space}
     file.write_text(yaml.safe_dump(entries))
     return ["sweep", str(file), "--storage", database, "--n_trials", "1"]
 

@@ -53,8 +53,9 @@ def connect(url: str, silent: Callable[[Study, FrozenTrial], None]) -> RDBStorag
         finally:
             gate.dispose()
     except ImportError as error:
+        missing = error.__cause__ or error
         raise ConfigError(
-            f"--storage {shown(url)} needs a driver ({error.__cause__ or error}); `uv sync --extra sweep` installs it"
+            f"--storage {shown(url)} needs a driver ({missing}); `uv sync --extra sweep` installs it"
         ) from error
     except (SQLAlchemyError, OptunaError, RuntimeError, OSError, sqlite3.Error) as error:
         told = str(getattr(error, "orig", None) or error).splitlines()[0]
