@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from lightning_pose.plots import BASELINES, MODEL, OTHERS, SMALLEST, STYLE, TRUTH, Errors, log_axis, longest_axes
 
-__all__ = ["error_and_time", "error_by_length", "relative_trajectories", "responses"]
+__all__ = ["error_by_length", "relative_trajectories", "responses"]
 
 CLIP_BASELINES = {
     "no_motion": ("#8c8c8c", (0, (1, 1.5))),
@@ -103,53 +103,6 @@ def error_by_length(
         axes.set(xlabel="clip length (frames)", ylabel=label)
     if errors:
         figure.legend(handles=panels[0].get_lines(), loc="outside lower center", ncols=5, handlelength=3.5)
-    return figure
-
-
-@matplotlib.rc_context(STYLE)
-def error_and_time(
-    features: ArrayLike,
-    position_median_m: Mapping[str, ArrayLike],
-    train_seconds: Mapping[str, ArrayLike],
-    title: str = "What more features bring, and cost",
-    unit: str = "m",
-) -> Figure:
-    """Median position error and training time against the number of features of an image (thesis, fig. 6.6).
-
-    Errors are full lines on the left axis, times dashed lines on the right one; both axes begin at zero. A system
-    keeps its colour.
-
-    Args:
-        features: (K,) numbers of features, above zero.
-        position_median_m: system to (K,) median position errors.
-        train_seconds: system to (K,) training times; shown in minutes or hours where these are long.
-        title: the heading.
-        unit: unit of the errors.
-    """
-    features = np.asarray(features, float)
-    looks = _looks([*position_median_m, *train_seconds])
-    seconds = {name: np.asarray(times, float) for name, times in train_seconds.items()}
-    longest = _greatest(seconds.values())
-    divisor, time_unit = next((d, u) for d, u in ((3600, "h"), (60, "min"), (1, "s")) if longest >= 3 * d or d == 1)
-    figure = Figure(figsize=(8, 5.2), dpi=150, layout="constrained")
-    left = figure.add_subplot(title=title)
-    right = left.twinx()
-    right.grid(visible=False)
-    right.spines["right"].set_visible(True)
-    for axes, values, dash, marker, what in (
-        (left, {name: np.asarray(errors, float) for name, errors in position_median_m.items()}, "-", "o", "error"),
-        (right, {name: times / divisor for name, times in seconds.items()}, (0, (5, 1.5)), "s", "time"),
-    ):
-        for name, y in values.items():
-            style = {"color": looks[name][0], "linestyle": dash, "markerfacecolor": "white" if marker == "s" else None}
-            axes.plot(features, y, marker, label=f"{name}: {what}", linewidth=2, **style)
-        axes.set_ylim(0, 1.1 * (_greatest(values.values()) or 1))
-    _log_axis_of(left, features)
-    left.set(xlabel="features of an image", ylabel=f"median position error ({unit}), full line")
-    right.set_ylabel(f"training time ({time_unit}), dashed line")
-    handles = [*left.get_lines(), *right.get_lines()]
-    if handles:
-        figure.legend(handles=handles, loc="outside lower center", ncols=2, handlelength=3.5)
     return figure
 
 
@@ -244,11 +197,6 @@ def _log_axis_of(axes: Axes, values: np.ndarray) -> None:
         if not kept or kept[-1] >= gap * value:
             kept.append(float(value))
     axes.xaxis.set_major_locator(FixedLocator(kept))
-
-
-def _greatest(arrays: Iterable[np.ndarray]) -> float:
-    """The greatest finite value, or 0."""
-    return max((float(value) for array in arrays for value in array if np.isfinite(value)), default=0.0)
 
 
 def _height(row: Sequence[np.ndarray]) -> float:

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.text import Text
 
-from lightning_pose.clip_plots import CLIP_BASELINES, error_and_time, error_by_length, relative_trajectories, responses
+from lightning_pose.clip_plots import CLIP_BASELINES, error_by_length, relative_trajectories, responses
 from lightning_pose.plots import MODEL, TRUTH
 
 RNG = np.random.default_rng(0)
@@ -29,9 +29,6 @@ ERRORS = {
     "no_motion": (0.01 * LENGTHS**0.8, LENGTHS**0.8),
     "constant_velocity": (0.002 * LENGTHS**1.2, 0.3 * LENGTHS),
 }
-FEATURES = np.array([5, 10, 25, 50, 100, 200, 250, 300])
-MEDIANS = {"CNN3D": 0.32 - 0.05 * np.log10(FEATURES), "CNNRNN": 0.42 - 0.05 * np.log10(FEATURES)}
-SECONDS = {"CNN3D": 120 + 6.0 * FEATURES, "CNNRNN": 60 + 4.0 * FEATURES}
 MAPS = {"convolution 1": [RNG.random((40, 40))] * 3, "activation 1": [RNG.random((20, 20))] * 11}
 
 
@@ -145,23 +142,6 @@ def test_error_by_length_has_a_line_a_system_in_its_own_colour() -> None:
     ]
 
 
-def test_errors_have_the_left_axis_and_times_the_right() -> None:
-    figure = draw(error_and_time(FEATURES, MEDIANS, SECONDS))
-    left, right = figure.axes
-    np.testing.assert_allclose(points(left.get_lines()[0])[:, 1], MEDIANS["CNN3D"])
-    np.testing.assert_allclose(points(right.get_lines()[1])[:, 1], SECONDS["CNNRNN"] / 60)
-    assert right.get_ylabel() == "training time (min), dashed line"
-    assert [axes.get_ylim()[0] for axes in (left, right)] == [0, 0]
-    assert list(colors(left).values()) == list(colors(right).values())
-    assert legend(figure) == ["CNN3D: error", "CNNRNN: error", "CNN3D: time", "CNNRNN: time"]
-
-
-@pytest.mark.parametrize(("seconds", "unit"), [(90, "s"), (1800, "min"), (20000, "h")])
-def test_times_are_in_a_unit_that_reads_well(seconds: float, unit: str) -> None:
-    figure = error_and_time([10, 100], {"a": [1, 1]}, {"a": [1, seconds]})
-    assert f"({unit})" in figure.axes[1].get_ylabel()
-
-
 def test_responses_have_a_row_a_layer_without_ticks() -> None:
     image = RNG.integers(0, 255, (30, 40, 3), dtype=np.uint8)
     figure = draw(responses([image, image[..., 0]], MAPS))
@@ -191,7 +171,6 @@ def test_responses_have_a_row_a_layer_without_ticks() -> None:
         pytest.param(
             lambda: error_by_length(np.arange(2, 401), {"CNN3D": (np.ones(399), np.ones(399))}), id="all lengths"
         ),
-        pytest.param(lambda: error_and_time(FEATURES, MEDIANS, SECONDS), id="features"),
         pytest.param(lambda: responses([np.zeros((300, 64))] * 5, MAPS), id="responses"),
     ],
 )
@@ -220,8 +199,6 @@ def test_no_two_texts_overlap_or_leave_the_figure(make: Callable[[], Figure]) ->
         pytest.param(lambda: error_by_length(LENGTHS, {}), id="no system"),
         pytest.param(lambda: error_by_length([50], {"a": ([0.0], [np.nan])}), id="one length, zero and NaN"),
         pytest.param(lambda: error_by_length([], {"a": ([], [])}), id="no length"),
-        pytest.param(lambda: error_and_time(FEATURES, {}, {}), id="no system's cost"),
-        pytest.param(lambda: error_and_time([5], {"a": [np.nan]}, {"b": [np.inf]}), id="cost NaN"),
         pytest.param(lambda: responses([], {}), id="no layer"),
         pytest.param(
             lambda: responses([], {"a": [np.zeros((4, 4)), np.full((4, 4), np.nan)], "b": []}), id="dead filter"
