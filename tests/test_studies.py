@@ -186,6 +186,7 @@ def test_the_command_line_narrows_a_study(study: Study) -> None:
         ({"figure": 3}, "figure is 3; give {x: "),
         ({"base": ["tiny.yaml", "tiny.yaml"]}, "base configs of the same file name"),
         ({"base": []}, "names no base config"),
+        ({"space": {"model.loss.orientation_weight": [1.0, 9.0]}}, "objective val/loss means something else for each"),
         ({"measure": "features", "objective": "val/loss"}, "objective val/loss is not known"),
         ({"base": ["tiny.yaml", "small.yaml"], "space": {"model.cell": ["gru"]}}, "space.model.cell is no setting"),
     ],

@@ -155,6 +155,9 @@ def read_plan(file: Path, overrides: Mapping[str, Any]) -> Plan:
         exhibit=parse_exhibit(raw.get("figure"), measure, space),
         resolved=resolved,
     )
+    weighed = [p.key for p in space if p.key.startswith("model.loss")]
+    if weighed and any(objective.metric == "val/loss" for objective in plan.objectives):
+        raise ConfigError(f"objective val/loss means something else for each {weighed[0]}; take val/position_median_m")
     if not str((resolved["trainer"]["logger"] or {}).get("class_path", "")).endswith("MLflowLogger"):
         base = next(iter(bases.values()))
         raise ConfigError(f"{base} has another trainer.logger, but a sweep keeps its trials in MLflow; leave it out")

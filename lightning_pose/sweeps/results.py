@@ -12,7 +12,7 @@ from optuna import Study
 from optuna.trial import FrozenTrial, TrialState
 from rich.table import Table
 
-from lightning_pose.sweeps.cells import as_csv, as_markdown, as_table, gather
+from lightning_pose.sweeps.cells import as_csv, as_markdown, as_table, gather, varying
 from lightning_pose.sweeps.config import ParsedConfig
 from lightning_pose.sweeps.drawing import draw_cells, draw_keypoints
 from lightning_pose.sweeps.features import keypoints_of_a_frame
@@ -90,16 +90,18 @@ def show_study(study: Study, plan: Plan, folder: Path) -> tuple[list[Path], Tabl
         return [], None
     cells = gather(study, plan)
     title = exhibit.title or study.study_name
+    if "data.root" not in varying(cells):  # where it does, the scenes are named beside their curves
+        title = f"{title}, {plan.scene}"
     figure = folder / "figure.png"
     if exhibit.kind == "pictures":
         shown = [ParsedConfig(plan.arguments(cell.values)) for cell in cells if cell.metrics]
         frames = [keypoints_of_a_frame(config) for config in shown]
         draw_keypoints({frame.scene: frame for frame in frames}, title).savefig(figure)
     else:
-        draw_cells(cells, exhibit, f"{title}, {plan.scene}").savefig(figure)
+        draw_cells(cells, exhibit, title).savefig(figure)
     (folder / "table.csv").write_text(as_csv(cells, plan))
     (folder / "table.md").write_text(as_markdown(cells, exhibit))
-    return [figure, folder / "table.csv", folder / "table.md"], as_table(cells, exhibit, f"{title}, {plan.scene}")
+    return [figure, folder / "table.csv", folder / "table.md"], as_table(cells, exhibit, title)
 
 
 def _short(value: Any) -> str:
