@@ -132,7 +132,7 @@ def _number(values: Sequence[float]) -> str:
     if not values:
         return ""
     shown = _short(fmean(values))
-    return shown if len(values) == 1 else f"{shown} ({_short(min(values))} to {_short(max(values))})"
+    return shown if min(values) == max(values) else f"{shown} ({_short(min(values))} to {_short(max(values))})"
 
 
 def _short(value: float) -> str:
