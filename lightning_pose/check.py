@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 from collections import Counter
 from collections.abc import Iterator
@@ -17,6 +16,7 @@ from rich.table import Table
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
+from lightning_pose.arguments import VerbParser
 from lightning_pose.data.formats import known_formats, load_scene
 from lightning_pose.data.scene import SPLITS, Scene
 from lightning_pose.errors import ImageError
@@ -227,9 +227,9 @@ def _counted(sizes: Counter[str]) -> str:
     return ", ".join(size if len(sizes) == 1 else f"{size} ({count})" for size, count in sizes.most_common(SHOWN))
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m lightning_pose check",
+def _parser() -> VerbParser:
+    parser = VerbParser(
+        "check",
         description="Say what a dataset holds and what is wrong with it. Exit code 0: usable; 2: it is not.",
     )
     parser.add_argument("dir", metavar="DIR", type=Path, help="the scene's folder")

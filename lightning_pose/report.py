@@ -6,8 +6,8 @@ import argparse
 import os
 import sys
 from pathlib import Path
-from typing import NoReturn
 
+from lightning_pose.arguments import VerbParser
 from lightning_pose.errors import ConfigError
 from lightning_pose.reports.pick import PICKS
 
@@ -144,19 +144,12 @@ def _pair(text: str) -> tuple[str, str]:
     return name, value
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        raise ConfigError(f"{message}; `python -m lightning_pose report --help` explains every option")
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
-        prog="python -m lightning_pose report",
+def _parser() -> VerbParser:
+    parser = VerbParser(
+        "report",
         usage="python -m lightning_pose report [--format FORMAT] [--scene NAME ...] [--by NAME ...] [--published] ...",
         description=HELP,
         epilog=RULES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
     )
     add = parser.add_argument
     add("--format", choices=FORMATS, help="default: what --out ends with (.md .tex .csv .json), or table")

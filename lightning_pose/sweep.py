@@ -5,12 +5,13 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any
 
 import yaml
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from lightning_pose.arguments import VerbParser
 from lightning_pose.errors import ConfigError
 
 if TYPE_CHECKING:  # Optuna and Lightning take seconds, and `--help` does without
@@ -158,8 +159,11 @@ def _conclude(study: Study, plan: Plan, client: MlflowClient, parent: str, folde
 
     best = best_trial(study, plan)
     if best is None:
-        told = [trial.user_attrs[REASON] for trial in study.get_trials(deepcopy=False) if REASON in trial.user_attrs]
+        trials = study.get_trials(deepcopy=False)
+        told = [trial.user_attrs[REASON] for trial in trials if REASON in trial.user_attrs]
         why = f"the last: {told[-1]}" if told else "give --n_trials 1 or more"
+        if not told and trials:
+            why = "other commands run it; wait for them"
         raise ConfigError(
             f"no trial of {study.study_name} has ended with a value ({tally(study) or 'none ran'}); {why}"
         )
@@ -211,19 +215,12 @@ def _read_value(text: str) -> Any:
         return text
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        raise ConfigError(f"{message}; `python -m lightning_pose sweep --help` explains every option")
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
-        prog="python -m lightning_pose sweep",
+def _parser() -> VerbParser:
+    parser = VerbParser(
+        "sweep",
         usage="python -m lightning_pose sweep FILE [--n_trials N] [--workers W] [--SETTING VALUE ...]",
         description=HELP,
         epilog=FILE_HELP,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
     )
     parser.add_argument("file", metavar="FILE", type=Path, help="sweep file, such as sweeps/surf_cnn.yaml")
     parser.add_argument("--n_trials", type=_count(0), metavar="N", help="this many more (default: the file's, or 20)")

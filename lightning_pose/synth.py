@@ -7,6 +7,7 @@ from pathlib import Path
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from lightning_pose.arguments import VerbParser
 from lightning_pose.data.synthetic import render_room
 
 __all__ = ["main"]
@@ -34,12 +35,11 @@ def main(argv: list[str]) -> int:
     return 0
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m lightning_pose synth",
+def _parser() -> VerbParser:
+    parser = VerbParser(
+        "synth",
         description=DESCRIPTION,
         epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("dir", metavar="DIR", type=Path, help="folder to write; its parents are made")
     parser.add_argument("--seed", metavar="N", type=int, default=0, help="which room (default: 0)")
