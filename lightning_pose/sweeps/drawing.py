@@ -52,8 +52,9 @@ def draw_cells(cells: Sequence[Cell], exhibit: Exhibit, title: str) -> Figure:
             axes.set_ylim(0, 1.05 * axes.get_ylim()[1])
         if "x" in exhibit.log:
             axes.set_xscale("log")
-    handles, labels = figure.axes[0].get_legend_handles_labels()
-    if len(labels) > 1:
+    named_lines = {label: handle for axes in figure.axes for handle, label in zip(*axes.get_legend_handles_labels())}  # noqa: B905
+    if len(named_lines) > 1:
+        labels, handles = list(named_lines), list(named_lines.values())
         figure.legend(handles, labels, loc="outside lower center", ncols=min(4, len(labels)))
     return figure
 
