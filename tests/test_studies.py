@@ -246,6 +246,18 @@ def test_a_figure_has_a_line_for_each_other_setting() -> None:
     assert [text.get_text() for text in axes.get_xticklabels()] == ["1", "2", "4"]
 
 
+@pytest.mark.parametrize("kind", ["line", "bar"])
+def test_logarithmic_axes_hold_what_is_drawn(kind: str) -> None:
+    cells = [Cell({"model.units": units, "model.cell": "gru"}, [{TEST: units**2 / 100}]) for units in (1, 10, 100)]
+    (axes,) = draw_cells(cells, exhibit(y=TEST, kind=kind, log=["x", "y"] if kind == "line" else ["y"]), "").axes
+    assert axes.get_yscale() == "log"
+    low, high = axes.get_ylim()
+    assert 0.005 < low < 0.01
+    assert 100 < high < 200
+    if kind == "line":
+        assert [axes.get_xscale(), axes.get_xlim()[0] < 1 < 100 < axes.get_xlim()[1]] == ["log", True]
+
+
 def test_curves_are_averaged_over_seeds() -> None:
     cell = Cell({}, [{}, {}], [{"c": {2: 1.0, 4: 3.0}}, {"c": {2: 2.0}}])
     assert cell.curve("c") == {2: 1.5, 4: 3.0}

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
 from lightning_pose.images import read_rgb
-from lightning_pose.plots import BASELINES, MODEL, OTHERS, STYLE
+from lightning_pose.plots import BASELINES, MODEL, OTHERS, STYLE, log_axis
 from lightning_pose.sweeps.cells import Cell, named, varying
 from lightning_pose.sweeps.exhibit import Exhibit
 from lightning_pose.sweeps.features import FrameKeypoints
@@ -47,16 +47,23 @@ def draw_cells(cells: Sequence[Cell], exhibit: Exhibit, title: str) -> Figure:
             _settings(axes, lines, metric, exhibit)
         axes.set_ylabel(exhibit.label(metric))
         if "y" in exhibit.log:
-            axes.set_yscale("log")
+            _make_log(axes, "y")
         elif exhibit.kind != "curve":
             axes.set_ylim(0, 1.05 * axes.get_ylim()[1])
         if "x" in exhibit.log:
-            axes.set_xscale("log")
+            _make_log(axes, "x")
     named_lines = {label: handle for axes in figure.axes for handle, label in zip(*axes.get_legend_handles_labels())}  # noqa: B905
     if len(named_lines) > 1:
         labels, handles = list(named_lines), list(named_lines.values())
         figure.legend(handles, labels, loc="outside lower center", ncols=min(4, len(labels)))
     return figure
+
+
+def _make_log(axes: Axes, which: str) -> None:
+    """Logarithmic, a little wider than what is drawn, and wide enough for ticks to read."""
+    i = "xy".index(which)
+    low, high = axes.dataLim.minpos[i], axes.dataLim.get_points()[1, i]  # type: ignore[index]  # bars begin at 0
+    log_axis(axes, which, (0.85 * low, max(1.15 * high, 4 * low)))
 
 
 def _lines(cells: Sequence[Cell], exhibit: Exhibit) -> Lines:
