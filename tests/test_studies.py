@@ -80,6 +80,8 @@ def test_a_study_of_two_systems_measures_the_test_frames(
     assert [(row["base"], row["model.units"]) for row in found] == [
         ("tiny", "4"), ("tiny", "8"), ("small", "4"), ("small", "4"), ("small", "8"), ("small", "8"),
     ]  # fmt: skip
+    assert [row["seed_everything"] for row in found[:2]] == ["", ""]
+    assert {row["seed_everything"] for row in found[2:4]} == {"0", "1"}
     runs = {run.data.metrics[TEST]: run for run in workplace.runs() if "mlflow.parentRunId" in run.data.tags}
     assert {float(row[TEST]) for row in found} == set(runs), "MLflow has the same numbers"
     assert {run.data.tags["architecture"] for run in runs.values()} == {"SurfLSTM", "SurfCNN"}
@@ -88,9 +90,9 @@ def test_a_study_of_two_systems_measures_the_test_frames(
     folder = workplace.folder / "mlruns" / "sweeps" / "study-wall"
     assert plt.imread(folder / "figure.png").shape[0] > 500
     lines = (folder / "table.md").read_text().splitlines()
-    assert lines[0] == "| system | cell | units | trials | median position error (m) | parameters |"
-    assert lines[2].startswith("| tiny | gru | 4 | 1 | ")
-    assert lines[4].startswith("| small |  | 4 | 2 | "), "seeds are one row"
+    assert lines[0] == "| system | units | trials | median position error (m) | parameters |"
+    assert lines[2].startswith("| tiny | 4 | 1 | ")
+    assert lines[4].startswith("| small | 4 | 2 | "), "seeds are one row"
     assert " to " in lines[4]
     assert not list((workplace.folder / "mlruns" / "checkpoints").glob("*")), "trials keep no checkpoints"
     parent = next(run for run in workplace.runs() if "mlflow.parentRunId" not in run.data.tags)

@@ -28,6 +28,7 @@ class Cell:
 
     Attributes:
         values: their settings, without the seed.
+        seeds: of each trial that ended, None where no seed was searched.
         metrics: of each trial that ended.
         curves: of each trial that ended.
         reason: why there is no trial that ended; None if there is.
@@ -37,6 +38,7 @@ class Cell:
     metrics: list[Mapping[str, float]] = field(default_factory=list)
     curves: list[Mapping[str, Curve]] = field(default_factory=list)
     reason: str | None = None
+    seeds: list[Any] = field(default_factory=list)
 
     def all(self, metric: str) -> list[float]:
         """One value of each trial that has it."""
@@ -71,6 +73,7 @@ def gather(study: Study, plan: Plan) -> list[Cell]:
 def _take(cell: Cell, trial: FrozenTrial) -> None:
     if trial.state == TrialState.COMPLETE:
         cell.metrics.append(trial.user_attrs.get(METRICS, {}))
+        cell.seeds.append(trial.params.get(SEED))
         curves = trial.user_attrs.get(CURVES, {})
         cell.curves.append({name: {int(n): value for n, value in points} for name, points in curves.items()})
         cell.reason = None
@@ -103,10 +106,10 @@ def named(value: Any) -> str:
 
 
 def varying(cells: Iterable[Cell]) -> list[str]:
-    """The settings in which they differ."""
+    """The settings that have several values; what a system alone has, and always the same, tells nothing apart."""
     cells = list(cells)
     keys = dict.fromkeys(key for cell in cells for key in cell.values)
-    return [key for key in keys if len({str(cell.values.get(key, "")) for cell in cells}) > 1]
+    return [key for key in keys if len({str(cell.values[key]) for cell in cells if key in cell.values}) > 1]
 
 
 def _rows(cells: Sequence[Cell], exhibit: Exhibit) -> tuple[list[str], list[list[str]]]:
@@ -160,12 +163,15 @@ def as_markdown(cells: Sequence[Cell], exhibit: Exhibit) -> str:
 def as_csv(cells: Sequence[Cell], plan: Plan) -> str:
     """Everything that was measured, one line a trial, at full precision."""
     keys = [parameter.key for parameter in plan.space if parameter.key != SEED]
+    seeded = [SEED] * any(seed is not None for cell in cells for seed in cell.seeds)
     metrics = sorted({name for cell in cells for found in cell.metrics for name in found})
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*keys, *metrics, "failed"])
+    writer.writerow([*keys, *seeded, *metrics, "failed"])
     for cell in cells:
         settings = [cell.values.get(key, "") for key in keys]
-        for found in cell.metrics or [{}]:
-            writer.writerow([*settings, *(found.get(name, "") for name in metrics), cell.reason or ""])
+        for found, seed in zip(cell.metrics or [{}], cell.seeds or [""], strict=True):
+            writer.writerow(
+                [*settings, *([seed] * len(seeded)), *(found.get(name, "") for name in metrics), cell.reason or ""]
+            )
     return text.getvalue()

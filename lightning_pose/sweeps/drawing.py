@@ -86,7 +86,10 @@ def _told(key: str, value: Any, exhibit: Exhibit) -> str:
 def _settings(axes: Axes, lines: Lines, metric: str, exhibit: Exhibit) -> None:
     places = _places(lines, exhibit)
     numeric = exhibit.kind == "line" and all(isinstance(place, float) for place in places.values())
-    width = 0.8 / len(lines)
+    bars = {
+        place: [label for label, cells in lines.items() if _has(cells, exhibit, name)] for name, place in places.items()
+    }
+    width = 0.8 / max(len(labels) for labels in bars.values())
     for i, (label, cells) in enumerate(lines.items()):
         held = [(places[named(cell.values.get(exhibit.x))], cell) for cell in cells if cell.all(metric)]
         x, y = [place for place, _ in held], [fmean(cell.all(metric)) for _, cell in held]
@@ -94,7 +97,7 @@ def _settings(axes: Axes, lines: Lines, metric: str, exhibit: Exhibit) -> None:
         if exhibit.kind == "line":
             axes.plot(x, y, "o-", color=color, linewidth=2, markersize=5, label=label)
         else:
-            x = [place + (i - (len(lines) - 1) / 2) * width for place in x]
+            x = [place + (bars[place].index(label) - (len(bars[place]) - 1) / 2) * width for place in x]
             axes.bar(x, y, 0.9 * width, color=color, label=label)
         seeds = [(place, value) for place, (_, cell) in zip(x, held, strict=True) for value in cell.all(metric)]
         if len(seeds) > len(held):
@@ -107,6 +110,10 @@ def _settings(axes: Axes, lines: Lines, metric: str, exhibit: Exhibit) -> None:
         axes.set_xticks(list(places.values()), list(places), **tilt)
         axes.xaxis.set_minor_locator(NullLocator())
     axes.set_xlabel(exhibit.label(exhibit.x))
+
+
+def _has(cells: Sequence[Cell], exhibit: Exhibit, name: str) -> bool:
+    return any(named(cell.values.get(exhibit.x)) == name for cell in cells)
 
 
 def _places(lines: Lines, exhibit: Exhibit) -> dict[str, float | int]:
