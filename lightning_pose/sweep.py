@@ -25,7 +25,7 @@ __all__ = ["main"]
 
 N_TRIALS = 20
 
-HELP = """Search the settings of a config for what is best on its validation frames. Test frames are not looked at.
+HELP = """Search the settings of a config for what is best on its validation frames. Test frames choose nothing.
 
   a search                     sweep sweeps/surf_cnn.yaml --data.root DIR
   20 trials more               sweep sweeps/surf_cnn.yaml --data.root DIR --n_trials 20
@@ -144,6 +144,8 @@ def _run(study: Study, plan: Plan, job: Job, total: int, workers: int) -> None:
 def _best_so_far(study: Study, plan: Plan) -> str:
     from lightning_pose.sweeps.results import best_trial
 
+    if plan.measure == "features":
+        return ""  # nothing is trained, and no count is better than another
     best = best_trial(study, plan)
     if best is None:
         return "no value yet"
@@ -174,16 +176,16 @@ def _conclude(study: Study, plan: Plan, client: MlflowClient, parent: str, folde
     if plan.measure is None:  # a study has a figure of its own
         for file in draw_figures(study, plan, folder):
             client.log_artifact(parent, str(file), "figures")
-    for objective, value in zip(plan.objectives, best.values, strict=True):
-        client.log_metric(parent, f"best/{objective.metric}", value)
-    client.set_tag(parent, "sweep.best_trial", str(best.number))
     describe_parent(client, parent, study, plan)
     if rows is None or plan.measure is None:
         Console().print(table(study, plan))
     if rows is not None:
         Console().print(rows)
     print(f"{tally(study)}\nfigures and tables in {folder}")
-    if plan.measure != "features":
+    if plan.measure != "features":  # which train nothing
+        for objective, value in zip(plan.objectives, best.values, strict=True):
+            client.log_metric(parent, f"best/{objective.metric}", value)
+        client.set_tag(parent, "sweep.best_trial", str(best.number))
         config = write_best(best, study, plan, folder)
         client.log_artifact(parent, str(config))
         print(f"the best on validation frames: python -m lightning_pose fit --config {config}")

@@ -206,9 +206,9 @@ def exhibit(x: str = "model.units", **entries: Any) -> Exhibit:
 
 
 def test_names_of_values() -> None:
-    values = ["lightning_pose.features.SURF", "/data/chess", [8.0], [1, 2], None, True, 0.1, 30, "efficientnet_lite0"]
+    values = ["lightning_pose.features.SURF", "/data/fr1.xyz", [8.0], [1, 2], None, True, 0.1, 30, "efficientnet_lite0"]
     assert [named(value) for value in values] == [
-        "SURF", "chess", "8", "[1, 2]", "none", "yes", "0.1", "30", "efficientnet_lite0",
+        "SURF", "fr1.xyz", "8", "[1, 2]", "none", "yes", "0.1", "30", "efficientnet_lite0",
     ]  # fmt: skip
 
 

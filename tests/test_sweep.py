@@ -20,6 +20,7 @@ from optuna.trial import TrialState
 
 from lightning_pose.sweeps.database import shown
 from lightning_pose.sweeps.plan import read_plan
+from lightning_pose.sweeps.trial import EpochWatch
 from tests.helpers import REPOSITORY, Workplace
 
 CONFIGS = sorted((REPOSITORY / "configs").glob("*.yaml"))
@@ -150,6 +151,31 @@ def test_a_sweep_leaves_runs_and_a_config_that_trains_and_goes_on(
     fitted = workplace.runs()[0]
     assert fitted.data.params["model.units"] == str(best.params["model.units"])
     assert fitted.data.metrics["val/position_median_m"] == pytest.approx(best.value or 0, rel=1e-4)
+
+
+def test_a_trial_is_worth_what_fit_would_keep_of_it(workplace: Workplace, sweep_file: Sweep) -> None:
+    settings = {"trainer.max_epochs": 6, "model.learning_rate": 0.3, "best.monitor": "val/orientation_median_deg"}
+    file = sweep_file(objective="val/position_median_m", pruner="none", settings=settings)
+    assert workplace.command("sweep", file, "--n_trials", "1") == 0
+    (trial,) = trials(workplace)
+    assert (
+        workplace.command("fit", "--config", workplace.folder / "mlruns" / "sweeps" / "units-wall" / "best.yaml") == 0
+    )
+    fitted = workplace.runs()[0]
+    assert trial.value == pytest.approx(fitted.data.metrics["best/val/position_median_m"], rel=1e-4)
+
+
+def test_the_epoch_that_fit_keeps_counts_and_not_the_best_of_the_objective(sweep_file: Sweep) -> None:
+    plan = read_plan(sweep_file(objective="val/position_median_m"), {})
+    watch = EpochWatch(plan, optuna.trial.create_trial(value=0.0))  # type: ignore[arg-type]
+    watch.epochs = [
+        {"val/loss": 0.9, "val/position_median_m": 0.1},
+        {"val/loss": 0.5, "val/position_median_m": 0.3},
+        {"val/loss": float("nan"), "val/position_median_m": 0.2},
+    ]
+    assert watch.values() == watch.epochs[1]
+    watch.monitor = "val/position_median_m"
+    assert watch.values() == watch.epochs[0]
 
 
 def test_a_grid_ends_and_a_trial_that_fails_does_not_end_it(

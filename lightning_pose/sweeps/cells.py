@@ -44,11 +44,6 @@ class Cell:
         """One value of each trial that has it."""
         return [found[metric] for found in self.metrics if metric in found]
 
-    def mean(self, metric: str) -> float | None:
-        """Their mean; None where no trial has it."""
-        held = self.all(metric)
-        return fmean(held) if held else None
-
     def curve(self, name: str) -> dict[int, float]:
         """The mean of its trials' curves of a name."""
         held = [curves[name] for curves in self.curves if name in curves]
@@ -95,7 +90,7 @@ def _is_number(value: Any) -> bool:
 def named(value: Any) -> str:
     """A setting's value as a figure or table shows it: a class without its module, a folder without the way to it."""
     if isinstance(value, str):
-        return value.rpartition("/")[2].rpartition(".")[2] if "/" in value or "." in value else value
+        return value.rpartition("/" if "/" in value else ".")[2]
     if isinstance(value, float):
         return f"{value:g}"
     if isinstance(value, list) and len(value) == 1:

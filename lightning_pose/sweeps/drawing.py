@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
+from lightning_pose.clip_plots import CLIP_BASELINES
 from lightning_pose.images import read_rgb
 from lightning_pose.plots import BASELINES, MODEL, OTHERS, STYLE, log_axis
 from lightning_pose.sweeps.cells import Cell, named, varying
@@ -147,23 +148,29 @@ def _curves(axes: Axes, lines: Lines, name: str, exhibit: Exhibit) -> None:
         if name.endswith("histogram"):
             line.set(drawstyle="steps-post", marker="")
     for baseline in exhibit.beside:
-        curve = next(iter(lines.values()))[0].curve(name.replace("test/", f"baseline/{baseline}/"))
-        color, dash = BASELINES.get(baseline, ("#8c8c8c", "--"))
-        axes.plot(list(curve), list(curve.values()), color=color, linestyle=dash, label=baseline)
+        _draw_baseline(axes, baseline, next(iter(lines.values()))[0].curve(_of_baseline(name, baseline)))
     axes.set_xlabel(exhibit.label("x"))
 
 
 def _baselines(axes: Axes, lines: Lines, metric: str, exhibit: Exhibit, places: Mapping[str, float | int]) -> None:
     """What stands beside the model at each place, as a dashed line."""
     for baseline in exhibit.beside:
-        name = metric.replace("test/", f"baseline/{baseline}/")
+        name = _of_baseline(metric, baseline)
         at: dict[float, list[float]] = {}
         for cell in (cell for cells in lines.values() for cell in cells):
             at.setdefault(places[named(cell.values.get(exhibit.x))], []).extend(cell.all(name))
         drawn = {place: fmean(values) for place, values in sorted(at.items()) if values}
         if drawn and name != metric:
-            color, dash = BASELINES.get(baseline, ("#8c8c8c", "--"))
-            axes.plot(list(drawn), list(drawn.values()), color=color, linestyle=dash, linewidth=1.6, label=baseline)
+            _draw_baseline(axes, baseline, drawn)
+
+
+def _of_baseline(metric: str, baseline: str) -> str:
+    return metric.replace("test/", f"baseline/{baseline}/")
+
+
+def _draw_baseline(axes: Axes, name: str, points: Mapping[float, float]) -> None:
+    color, dash = (BASELINES | CLIP_BASELINES).get(name, ("#8c8c8c", "--"))
+    axes.plot(list(points), list(points.values()), color=color, linestyle=dash, linewidth=1.6, label=name)
 
 
 @matplotlib.rc_context(STYLE)

@@ -7,13 +7,11 @@ from mlflow.exceptions import MlflowException
 from optuna import Study
 
 from lightning_pose.sweeps.plan import Plan
-from lightning_pose.sweeps.results import best_trials, tally
+from lightning_pose.sweeps.results import SHOWN, best_trials, short, tally
 from lightning_pose.sweeps.trial import RUN
 from lightning_pose.tracking import MLflowLogger
 
 __all__ = ["close_run", "describe_parent", "open_parent"]
-
-SHOWN = 10
 
 
 def open_parent(study: Study, plan: Plan) -> tuple[MlflowClient, str]:
@@ -53,15 +51,11 @@ def describe_parent(client: MlflowClient, run: str, study: Study, plan: Plan) ->
     names = [objective.metric for objective in plan.objectives]
     lines = [f"{tally(study)}\n", f"| trial | {' | '.join(names)} | settings |", f"|---|{'---|' * len(names)}---|"]
     for trial in best_trials(study, plan)[:SHOWN]:
-        values = " | ".join(_cell(value) for value in trial.values)
+        values = " | ".join(short(value) for value in trial.values)
         # In one column, which wraps: a wide table pushes the rest off MLflow's page.
-        settings = ", ".join(f"{key.partition('.')[2]} {_cell(value)}" for key, value in trial.params.items())
+        settings = ", ".join(f"{key.partition('.')[2]} {short(value)}" for key, value in trial.params.items())
         lines.append(f"| {trial.number} | {values} | {settings} |")
     client.set_tag(run, "mlflow.note.content", "\n".join(lines))
-
-
-def _cell(value: object) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def close_run(client: MlflowClient, run: str | None, reason: str) -> None:

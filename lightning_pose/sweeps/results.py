@@ -19,7 +19,18 @@ from lightning_pose.sweeps.features import keypoints_of_a_frame
 from lightning_pose.sweeps.plan import Objective, Plan
 from lightning_pose.sweeps.trial import REASON
 
-__all__ = ["best_trial", "best_trials", "completed", "draw_figures", "show_study", "table", "tally", "write_best"]
+__all__ = [
+    "SHOWN",
+    "best_trial",
+    "best_trials",
+    "completed",
+    "draw_figures",
+    "short",
+    "show_study",
+    "table",
+    "tally",
+    "write_best",
+]
 
 SHOWN = 10
 
@@ -65,7 +76,7 @@ def table(study: Study, plan: Plan) -> Table:
     for name in ("trial", *(o.metric for o in plan.objectives), *_last_names(keys)):
         shown.add_column(name, justify="right", overflow="fold")
     for trial in best_trials(study, plan)[:SHOWN]:
-        params = [_short(trial.params.get(key, "")) for key in keys]
+        params = [short(trial.params.get(key, "")) for key in keys]
         shown.add_row(str(trial.number), *(f"{value:.4g}" for value in trial.values), *params)
     failed = [t for t in study.get_trials(deepcopy=False, states=(TrialState.FAIL,)) if REASON in t.user_attrs]
     if failed:
@@ -104,7 +115,7 @@ def show_study(study: Study, plan: Plan, folder: Path) -> tuple[list[Path], Tabl
     return [figure, folder / "table.csv", folder / "table.md"], as_table(cells, exhibit, title)
 
 
-def _short(value: Any) -> str:
+def short(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 

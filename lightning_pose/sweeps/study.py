@@ -139,7 +139,7 @@ def _sampler(plan: Plan, seed: int | None = None) -> samplers.BaseSampler:
     if name == "cmaes" and len(plan.objectives) > 1:
         raise ConfigError("sampler cmaes serves one objective; take nsga2 or tpe for several")
     if name == "cmaes" and find_spec("cmaes") is None:  # Optuna would find out in the middle of the sweep
-        raise ConfigError("sampler cmaes needs the package cmaes; `uv pip install cmaes` installs it, or take tpe")
+        raise ConfigError("sampler cmaes needs the package cmaes; `uv sync --extra sweep` installs it, or take tpe")
     options: dict[str, Any] = {"seed": plan.seed if seed is None else seed}
     if name == "qmc":
         options["seed"] = plan.seed  # all workers take their points from one sequence, which the study counts

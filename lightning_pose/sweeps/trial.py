@@ -53,18 +53,25 @@ class EpochWatch(Callback):
     Args:
         plan: of the sweep.
         trial: what reports go to.
+
+    Attributes:
+        monitor: the metric whose lowest value says which epoch's weights `fit` keeps.
+        epochs: the metrics of each.
+        pruned: why it was cut short, None where it was not.
     """
 
     def __init__(self, plan: Plan, trial: Trial) -> None:
         self.objectives = plan.objectives
         self.trial = trial
+        self.monitor = "val/loss"
         self.epochs: list[dict[str, float]] = []
         self.pruned: str | None = None
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if trainer.sanity_checking:
             return
-        measured = {name: float(v) for name, v in trainer.callback_metrics.items() if name.startswith("val/")}
+        found = trainer.callback_metrics.items()
+        measured = {name: float(v) for name, v in found if name.startswith("val/") or name == self.monitor}
         self.epochs.append(measured)
         first = self.objectives[0].metric
         # Pruners compare trials by one number; Optuna refuses reports for several objectives.
@@ -77,8 +84,7 @@ class EpochWatch(Callback):
             trainer.should_stop = True
 
     def values(self) -> dict[str, float]:
-        """The metrics of the best epoch by the first objective that is measured; all of one epoch, so that
-        no mixture is reported that no weights ever had.
+        """The metrics of the epoch whose weights `fit` would keep, so that it finds again what the sweep has found.
 
         Raises:
             ConfigError: no validation frames, or no epoch ended in a number.
@@ -88,10 +94,11 @@ class EpochWatch(Callback):
             return {}
         if not self.epochs:
             raise ConfigError(f"{chosen.metric} was never measured; give data.val_fraction, such as 0.1")
-        finite = [epoch for epoch in self.epochs if math.isfinite(epoch[chosen.metric])]
+        needed = (chosen.metric, self.monitor)
+        finite = [epoch for epoch in self.epochs if all(math.isfinite(epoch.get(name, math.nan)) for name in needed)]
         if not finite:
             raise ConfigError(f"{chosen.metric} was never a finite number: training diverged; lower the learning rate")
-        return sorted(finite, key=lambda epoch: epoch[chosen.metric], reverse=chosen.maximize)[0]
+        return min(finite, key=lambda epoch: epoch[self.monitor])
 
 
 class _TrialCLI(PoseCLI):
@@ -112,6 +119,8 @@ class _TrialCLI(PoseCLI):
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
         trainer = super().instantiate_trainer(**kwargs)
         self.recorder.keeps_checkpoints = False
+        best = next(c for c in trainer.callbacks if isinstance(c, BestCheckpoint))  # type: ignore[attr-defined]
+        self.watch.monitor = best.monitor or self.watch.monitor
         wanted = BestCheckpoint if self.plan.measure == "test" else ()
         kept = [c for c in trainer.callbacks if not isinstance(c, ModelCheckpoint) or isinstance(c, wanted)]  # type: ignore[attr-defined]
         trainer.callbacks = [*kept, self.watch]  # type: ignore[attr-defined]
