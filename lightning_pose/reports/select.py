@@ -70,7 +70,7 @@ def select_runs(runs: Sequence[Run], filters: Filters) -> tuple[list[Run], list[
             "measure a checkpoint with `python -m lightning_pose test --ckpt_path CKPT`"
         )
     if missing:
-        notes.append(f"{missing} of {len(kept)} runs have no test errors, as trials of sweeps have none: left out")
+        notes.append(f"{missing} of {len(kept)} runs have no test errors, as most trials of sweeps: left out")
     return tested, notes
 
 
