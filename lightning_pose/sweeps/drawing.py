@@ -168,7 +168,7 @@ def _of_baseline(metric: str, baseline: str) -> str:
     return metric.replace("test/", f"baseline/{baseline}/")
 
 
-def _draw_baseline(axes: Axes, name: str, points: Mapping[float, float]) -> None:
+def _draw_baseline(axes: Axes, name: str, points: Mapping[int, float] | Mapping[float, float]) -> None:
     color, dash = (BASELINES | CLIP_BASELINES).get(name, ("#8c8c8c", "--"))
     axes.plot(list(points), list(points.values()), color=color, linestyle=dash, linewidth=1.6, label=name)
 
