@@ -6,7 +6,8 @@ import logging
 import os
 import socket
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,12 +35,13 @@ REQUIREMENTS = (
 )
 """What a logged model needs beside this package, which it carries along."""
 
+STORE_VARIABLE = "MLFLOW_TRACKING_URI"
 HOST_TAG, PROCESS_TAG = "process.host", "process.id"
 
 
 def default_tracking_uri(root: str | Path = "mlruns") -> str:
     """`MLFLOW_TRACKING_URI`, or a database under `root`."""
-    return os.environ.get("MLFLOW_TRACKING_URI") or f"sqlite:///{Path(root) / 'mlflow.db'}"
+    return os.environ.get(STORE_VARIABLE) or f"sqlite:///{Path(root) / 'mlflow.db'}"
 
 
 class MLflowLogger(MLFlowLogger):
@@ -83,8 +85,14 @@ class MLflowLogger(MLFlowLogger):
         self._claimed = False
 
     @property
+    def experiment(self) -> MlflowClient:
+        """The MLflow client of the store, with the run created: Lightning's name of it."""
+        with _environment_kept():
+            return super().experiment
+
+    @property
     def client(self) -> MlflowClient:
-        """The MLflow client of the store, with the run created."""
+        """The MLflow client of the store, with the run created, and this process its owner."""
         client = self.experiment
         if not self._claimed:
             self._claimed = True
@@ -118,6 +126,18 @@ class MLflowLogger(MLFlowLogger):
         """End the run: FINISHED, or `stopped_as` where Lightning says that it failed."""
         if self._initialized:
             self.client.set_terminated(str(self.run_id), self.stopped_as if status == "failed" else "FINISHED")
+
+
+@contextmanager
+def _environment_kept() -> Iterator[None]:
+    """MLflow writes the store that it is told into `MLFLOW_TRACKING_URI`, where the next logger would read it."""
+    before = os.environ.get(STORE_VARIABLE)
+    try:
+        yield
+    finally:
+        os.environ.pop(STORE_VARIABLE, None)
+        if before is not None:
+            os.environ[STORE_VARIABLE] = before
 
 
 def alive(process: int) -> bool:
@@ -186,14 +206,15 @@ def log_localizer(logger: MLflowLogger, checkpoint: Path) -> None:
     # uv has no pip; a table is no type hint; and it tells of a lock file that it copies.
     for noisy in ("mlflow.utils.environment", "mlflow.models.signature", "mlflow.utils.uv_utils"):
         logging.getLogger(noisy).setLevel(logging.ERROR)
-    mlflow.set_tracking_uri(logger.uri)
-    with mlflow.start_run(run_id=str(logger.run_id)), warnings.catch_warnings():
+    with _environment_kept(), warnings.catch_warnings():
         # The model takes files, for which MLflow has no schema; it warns of that in its own way.
         warnings.simplefilter("ignore", UserWarning)
-        mlflow.pyfunc.log_model(
-            name="model",
-            python_model=str(Path(__file__).with_name("pyfunc.py")),
-            artifacts={"checkpoint": str(checkpoint)},
-            code_paths=[str(Path(__file__).parent)],
-            pip_requirements=[f"{name}=={version(name)}" for name in REQUIREMENTS],
-        )
+        mlflow.set_tracking_uri(logger.uri)
+        with mlflow.start_run(run_id=str(logger.run_id)):
+            mlflow.pyfunc.log_model(
+                name="model",
+                python_model=str(Path(__file__).with_name("pyfunc.py")),
+                artifacts={"checkpoint": str(checkpoint)},
+                code_paths=[str(Path(__file__).parent)],
+                pip_requirements=[f"{name}=={version(name)}" for name in REQUIREMENTS],
+            )

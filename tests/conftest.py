@@ -19,8 +19,13 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported: each 
 def _hermetic(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("LIGHTNING_POSE_CACHE", str(tmp_path_factory.mktemp("cache")))
-        patch.delenv("MLFLOW_TRACKING_URI", raising=False)
         yield
+
+
+@pytest.fixture(autouse=True)
+def _no_store_of_another_test(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`mlflow.set_tracking_uri` keeps the store in the environment, where a later test would read it."""
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
 
 
 @pytest.fixture(scope="session")

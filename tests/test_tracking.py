@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import os
+import shutil
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -40,6 +41,17 @@ def test_the_environment_names_the_store(monkeypatch: pytest.MonkeyPatch) -> Non
     assert default_tracking_uri("/data/runs") == "sqlite:////data/runs/mlflow.db"
     monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://tracker:5000")
     assert default_tracking_uri() == "http://tracker:5000"
+
+
+def test_a_store_named_in_code_is_not_the_next_logger_s(tmp_path: Path, store: Path) -> None:
+    for name in ("first", "second"):
+        root = tmp_path / name
+        root.mkdir()
+        shutil.copy(store, root / "mlflow.db")
+        logger = MLflowLogger(root=str(root))
+        logger.client.set_tag(str(logger.run_id), "made", "by hand")
+        assert logger.uri == f"sqlite:///{root}/mlflow.db"
+    assert "MLFLOW_TRACKING_URI" not in os.environ
 
 
 def test_settings_by_dotted_name() -> None:
