@@ -20,6 +20,9 @@ class SurfCNN(PoseModule):
     the first three pools are 2x2 and the rest 1x2, along the descriptor, in ceil mode, which gives table 2.2's
     parameter counts. Each convolution is followed by ReLU, batch normalisation and its pool.
 
+    The order by strength changes from frame to frame. With `ordered` off, kernels, strides and pools reach along
+    each descriptor alone, and the maps are averaged over the features, so that their order does not matter.
+
     Args:
         channels: filters of each convolution.
         kernels: side of each convolution's kernel; the first has stride 2.
@@ -27,6 +30,7 @@ class SurfCNN(PoseModule):
             have, if not given.
         units: width of the fully connected layer.
         dropout: before the last linear layer.
+        ordered: whether it matters which feature is stronger than which; it does in the thesis.
         **kwargs: what `PoseModule` takes.
 
     Raises:
@@ -42,6 +46,7 @@ class SurfCNN(PoseModule):
         layers: int | None = None,
         units: int = 2048,
         dropout: float = 0.5,
+        ordered: bool = True,
         **kwargs: Any,
     ) -> None:
         super().__init__(**kwargs)
@@ -53,11 +58,12 @@ class SurfCNN(PoseModule):
             raise ConfigError(f"layers is {layers}; give 1 or more")
         depth = len(channels) if layers is None else layers
         channels, kernels = (sizes[:depth] + sizes[-1:] * (depth - len(sizes)) for sizes in (channels, kernels))
-        self.network = _ConvRegressor(self.input_shape, channels, kernels, units, dropout)
+        self.ordered = ordered
+        self.network = _ConvRegressor(self.input_shape, channels, kernels, units, dropout, ordered)
 
     @property
     def headline(self) -> str:
-        return f"N={self.input_shape[0]}"
+        return f"N={self.input_shape[0]}" + ("" if self.ordered else " unordered")
 
 
 class _ConvRegressor(nn.Module):
@@ -68,26 +74,29 @@ class _ConvRegressor(nn.Module):
         kernels: Sequence[int],
         units: int,
         dropout: float,
+        ordered: bool,
     ) -> None:
         super().__init__()
+        self.ordered = ordered
         stages: list[nn.Module] = []
         rows, columns = input_shape
         width = 1
         for i, (out, kernel) in enumerate(zip(channels, kernels, strict=True)):
             stride = 2 if i == 0 else 1
-            pool = (2 if i < 3 else 1, 2)
+            over_rows = (kernel, stride, 2 if i < 3 else 1) if ordered else (1, 1, 1)
+            kernels_2d, strides, pools = zip(over_rows, (kernel, stride, 2), strict=True)
             stages += [
-                nn.Conv2d(width, out, kernel, stride, padding=kernel // 2),
+                nn.Conv2d(width, out, kernels_2d, strides, padding=(kernels_2d[0] // 2, kernel // 2)),
                 nn.ReLU(),
                 nn.BatchNorm2d(out),
-                nn.MaxPool2d(pool, ceil_mode=True),
+                nn.MaxPool2d(pools, ceil_mode=True),
             ]
-            rows, columns = (-(-size // (stride * p)) for size, p in zip((rows, columns), pool, strict=True))
+            rows, columns = (-(-size // (s * p)) for size, s, p in zip((rows, columns), strides, pools, strict=True))
             width = out
         self.convolutions = nn.Sequential(*stages)
         self.head = nn.Sequential(
             nn.Flatten(),
-            nn.Linear(width * rows * columns, units),
+            nn.Linear(width * columns * (rows if ordered else 1), units),
             nn.ReLU(),
             nn.Dropout(dropout),
             nn.Linear(units, 7),
@@ -95,4 +104,5 @@ class _ConvRegressor(nn.Module):
 
     def forward(self, descriptors: Tensor) -> Tensor:
         """(B, N, D) -> (B, 7)."""
-        return self.head(self.convolutions(descriptors.unsqueeze(1)))
+        maps = self.convolutions(descriptors.unsqueeze(1))  # (B, channels, rows, columns)
+        return self.head(maps if self.ordered else maps.mean(dim=2))

@@ -16,9 +16,10 @@ def test_the_thesis_counts_its_parameters(n_features: int, parameters: float) ->
     assert sum(parameter.numel() for parameter in model.parameters()) == pytest.approx(parameters, rel=0.1)
 
 
+@pytest.mark.parametrize("ordered", [True, False])
 @pytest.mark.parametrize("shape", [(1, 64), (7, 33), (50, 128), (20, 68)])
-def test_any_input_has_a_pose(shape: tuple[int, int]) -> None:
-    model = SurfCNN(input_shape=list(shape), channels=[4, 4, 4, 4, 4], units=8).eval()
+def test_any_input_has_a_pose(shape: tuple[int, int], ordered: bool) -> None:
+    model = SurfCNN(input_shape=list(shape), channels=[4, 4, 4, 4, 4], units=8, ordered=ordered).eval()
     assert model(torch.randn(2, *shape)).position_m.shape == (2, 3)
 
 
@@ -44,5 +45,22 @@ def test_no_layers_are_refused() -> None:
         SurfCNN(input_shape=[20, 64], layers=0)
 
 
-def test_headline() -> None:
-    assert SurfCNN(input_shape=[100, 64], channels=[4], kernels=[3], units=8).headline == "N=100"
+@pytest.mark.parametrize("ordered", [True, False])
+def test_the_order_of_features_matters_only_where_it_is_told_to(ordered: bool) -> None:
+    model = SurfCNN(input_shape=[20, 64], channels=[4, 6], kernels=[7, 5], units=8, ordered=ordered).eval()
+    features = torch.randn(3, 20, 64)
+    before, after = (model.network(rows) for rows in (features, features.flip(1)))
+    assert torch.allclose(before, after, atol=1e-6) != ordered
+
+
+def test_an_unordered_network_is_as_large_for_any_number_of_features() -> None:
+    sizes = {
+        sum(parameter.numel() for parameter in SurfCNN(input_shape=[n, 64], units=8, ordered=False).parameters())
+        for n in (1, 30, 100)
+    }
+    assert len(sizes) == 1
+
+
+@pytest.mark.parametrize(("ordered", "headline"), [(True, "N=100"), (False, "N=100 unordered")])
+def test_headline(ordered: bool, headline: str) -> None:
+    assert SurfCNN([4], [3], units=8, ordered=ordered, input_shape=[100, 64]).headline == headline
