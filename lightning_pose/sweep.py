@@ -80,6 +80,8 @@ def main(argv: list[str]) -> int:
     own, overrides = _split(argv)
     args = _parser().parse_args(own)
     # Only now, so that `--help` is there at once.
+    from optuna.trial import TrialState
+
     from lightning_pose.sweeps.database import alone, shown
     from lightning_pose.sweeps.plan import read_plan
     from lightning_pose.sweeps.record import open_parent
@@ -109,7 +111,8 @@ def main(argv: list[str]) -> int:
         status = "FAILED"
         raise
     finally:
-        client.set_terminated(parent, status)
+        if not study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):  # else another command ends it
+            client.set_terminated(parent, status)
     print(f"run {parent} in {plan.tracking[0]}\nstudy {name} in {shown(args.storage)}")
     return 0
 

@@ -26,7 +26,17 @@ from mlflow.entities import Run
 from lightning_pose.__main__ import main
 from lightning_pose.features.base import FeatureExtractor, Record
 
-__all__ = ["REPOSITORY", "FailAt", "InterruptAt", "TerminateAt", "Thumbnails", "Trained", "Workplace", "write_scene"]
+__all__ = [
+    "REPOSITORY",
+    "FailAt",
+    "InterruptAt",
+    "KillOnce",
+    "TerminateAt",
+    "Thumbnails",
+    "Trained",
+    "Workplace",
+    "write_scene",
+]
 
 REPOSITORY = Path(__file__).parents[1]
 
@@ -85,6 +95,24 @@ class TerminateAt(FailAt):
 
     def stop(self) -> None:
         signal.raise_signal(signal.SIGTERM)
+
+
+class KillOnce(FailAt):
+    """Kills its process in the middle of an epoch, as `kill -9` does; the next process that comes there lives.
+
+    Args:
+        marker: a file that says that it has happened.
+        epoch: in which it happens.
+    """
+
+    def __init__(self, marker: str, epoch: int = 1) -> None:
+        super().__init__(epoch)
+        self.marker = Path(marker)
+
+    def stop(self) -> None:
+        with contextlib.suppress(FileExistsError):
+            self.marker.touch(exist_ok=False)
+            os.kill(os.getpid(), signal.SIGKILL)
 
 
 def write_scene(root: Path, train: Sequence[int] = (12, 12), test: int = 10, size: tuple[int, int] = (64, 48)) -> Path:

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import re
 import signal
-import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -103,7 +100,7 @@ def test_every_architecture_has_a_sweep_file() -> None:
 def test_the_thesis_has_its_studies() -> None:
     numbers = {2: (1, 2, 4, 5, 6), 3: (4, 5, 6), 4: (3, 5, 6, 7), 5: (3, 4), 6: (4, 6)}
     figures = {f"figure_{chapter}_{i}" for chapter, held in numbers.items() for i in held}
-    studies = figures | {"table_3_1", "table_5_1"}
+    studies = figures | {"table_3_1", "table_3_3", "table_5_1"}
     assert studies == {file.stem for file in SWEEPS if file.parent.name == "thesis"}
 
 
@@ -227,12 +224,10 @@ def test_workers_share_a_study_and_one_may_die(
     workplace: Workplace, sweep_file: Sweep, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Exactly the cells of the grid, each once, although a worker is killed in the middle of a trial."""
-    long = {"trainer.max_epochs": 10}  # enough for a busy machine to see a trial under way
-    file = sweep_file(sampler="grid", space={"model.units": [4, 5, 6]}, settings=long, pruner="none")
-    with ThreadPoolExecutor() as pool:
-        killer = pool.submit(_kill_worker, workplace)
-        assert workplace.command("sweep", file, "--workers", "2") == 0
-        killer.result()
+    killer = {"class_path": "tests.helpers.KillOnce", "init_args": {"marker": str(workplace.folder / "killed")}}
+    settings = {"trainer.max_epochs": 2, "trainer.callbacks": [killer]}
+    file = sweep_file(sampler="grid", space={"model.units": [4, 5, 6]}, settings=settings, pruner="none")
+    assert workplace.command("sweep", file, "--workers", "2") == 0
     told = capsys.readouterr().err
     assert "trial 3/3" in told
     assert re.search(r"^the process of trial \d died; it is run again as trial 3$", told, re.MULTILINE)
@@ -245,20 +240,6 @@ def test_workers_share_a_study_and_one_may_die(
     assert sorted(run.info.status for run in children) == ["FINISHED"] * 3 + ["KILLED"]
     (killed,) = (run for run in children if run.info.status == "KILLED")
     assert killed.data.tags["sweep.reason"] == "its process died"
-
-
-def _kill_worker(workplace: Workplace) -> None:
-    """Kill the process of a trial under way."""
-    deadline = time.monotonic() + 200
-    while time.monotonic() < deadline:
-        begun = len(workplace.runs()) > 1  # the study's and a trial's; looking earlier would make Optuna's tables
-        running = [t for t in trials(workplace) if t.state == TrialState.RUNNING] if begun else []
-        running = [trial for trial in running if "mlflow_run" in trial.user_attrs]
-        if running:
-            os.kill(int(running[0].user_attrs["process"].rpartition(":")[2]), signal.SIGKILL)
-            return
-        time.sleep(0.05)
-    raise AssertionError("no trial began")
 
 
 def test_an_interrupted_trial_is_run_again(

@@ -119,6 +119,22 @@ def test_a_machine_that_falls_silent_loses_its_trial(workplace: Workplace, capsy
     assert runs[busy_run].info.status == "RUNNING"
 
 
+def test_a_study_s_run_ends_with_the_last_command_that_works_at_it(workplace: Workplace) -> None:
+    def status() -> str:
+        (parent,) = (run for run in workplace.runs() if "mlflow.parentRunId" not in run.data.tags)
+        return parent.info.status
+
+    command = ["sweep", write(workplace), "--n_trials", "1"]
+    assert workplace.command(*command) == 0
+    assert status() == "FINISHED"
+    busy, _ = of_another_machine(workplace, minutes=0)
+    assert workplace.command(*command) == 0
+    assert status() == "RUNNING"
+    load(workplace).tell(busy, 1.0)
+    assert workplace.command(*command) == 0
+    assert status() == "FINISHED"
+
+
 def test_a_trial_gives_signs_of_life_while_it_trains(workplace: Workplace, monkeypatch: pytest.MonkeyPatch) -> None:
     signs: set[str] = set()
 

@@ -189,6 +189,7 @@ def run_trial(trial: Trial, plan: Plan, parent: str) -> float | list[float]:
     assert known is not None, "the study's run is in it"
     run = client.create_run(known.experiment_id, run_name=name, tags=tags | process_tags()).info.run_id
     trial.set_user_attr(RUN, run)
+    client.update_run(parent, status="RUNNING")  # a command that ended between two trials of this one has closed it
     try:
         values = draw(trial, plan.space)
         for key, value in values.items():
