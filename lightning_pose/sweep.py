@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -147,8 +148,8 @@ def _run(study: Study, plan: Plan, job: Job, total: int, workers: int) -> None:
 def _best_so_far(study: Study, plan: Plan) -> str:
     from lightning_pose.sweeps.results import best_trial
 
-    if plan.measure == "features":
-        return ""  # nothing is trained, and no count is better than another
+    if not plan.comparable:
+        return ""
     best = best_trial(study, plan)
     if best is None:
         return "no value yet"
@@ -173,24 +174,26 @@ def _conclude(study: Study, plan: Plan, client: MlflowClient, parent: str, folde
             f"no trial of {study.study_name} has ended with a value ({tally(study) or 'none ran'}); {why}"
         )
     folder.mkdir(parents=True, exist_ok=True)
-    files, rows = show_study(study, plan, folder)
-    for file in files:
-        client.log_artifact(parent, str(file), "study")
+    config = None
+    if plan.comparable:  # first of all: what follows only shows it
+        config = write_best(best, study, plan, folder)
+        client.log_artifact(parent, str(config))
+        client.set_tag(parent, "sweep.best_trial", str(best.number))
+        for objective, value in zip(plan.objectives, best.values, strict=True):
+            client.log_metric(parent, f"best/{objective.metric}", value)
+    describe_parent(client, parent, study, plan)
+    if plan.measure is None or plan.exhibit is None:
+        Console().print(table(study, plan))
     if plan.measure is None:  # a study has a figure of its own
         for file in draw_figures(study, plan, folder):
             client.log_artifact(parent, str(file), "figures")
-    describe_parent(client, parent, study, plan)
-    if rows is None or plan.measure is None:
-        Console().print(table(study, plan))
+    files, rows = show_study(study, plan, folder)
+    for file in files:
+        client.log_artifact(parent, str(file), "study")
     if rows is not None:
         Console().print(rows)
     print(f"{tally(study)}\nfigures and tables in {folder}")
-    if plan.measure != "features":  # which train nothing
-        for objective, value in zip(plan.objectives, best.values, strict=True):
-            client.log_metric(parent, f"best/{objective.metric}", value)
-        client.set_tag(parent, "sweep.best_trial", str(best.number))
-        config = write_best(best, study, plan, folder)
-        client.log_artifact(parent, str(config))
+    if config is not None:
         print(f"the best on validation frames: python -m lightning_pose fit --config {config}")
 
 
@@ -214,10 +217,13 @@ def _split(argv: list[str]) -> tuple[list[str], dict[str, Any]]:
 
 
 def _read_value(text: str) -> Any:
+    """YAML; but what it takes for a date, or for a number that is written otherwise, is a folder's name."""
     try:
-        return yaml.safe_load(text)
+        value = yaml.safe_load(text)
     except yaml.YAMLError:
         return text
+    misread = isinstance(value, date) or (type(value) is int and str(value) != text.strip())
+    return text if misread else value
 
 
 def _parser() -> VerbParser:

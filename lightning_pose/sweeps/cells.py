@@ -6,18 +6,20 @@ import csv
 import io
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from statistics import fmean
 from typing import Any
 
 from optuna import Study
 from optuna.trial import FrozenTrial, TrialState
+from rich.markup import escape
 from rich.table import Table
 
-from lightning_pose.sweeps.exhibit import SEED, Exhibit
+from lightning_pose.sweeps.exhibit import SCENE, SEED, Exhibit
 from lightning_pose.sweeps.plan import Plan
 from lightning_pose.sweeps.trial import CURVES, METRICS, REASON
 
-__all__ = ["Cell", "as_csv", "as_markdown", "as_table", "gather", "named", "varying"]
+__all__ = ["Cell", "as_csv", "as_markdown", "as_table", "gather", "name_scenes", "named", "varying"]
 
 Curve = Mapping[int, float]
 
@@ -28,6 +30,7 @@ class Cell:
 
     Attributes:
         values: their settings, without the seed.
+        names: what figures and tables call each value.
         seeds: of each trial that ended, None where no seed was searched.
         metrics: of each trial that ended.
         curves: of each trial that ended.
@@ -39,6 +42,10 @@ class Cell:
     curves: list[Mapping[str, Curve]] = field(default_factory=list)
     reason: str | None = None
     seeds: list[Any] = field(default_factory=list)
+    names: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.names = {key: named(value) for key, value in self.values.items()} | self.names
 
     def all(self, metric: str) -> list[float]:
         """One value of each trial that has it."""
@@ -61,8 +68,21 @@ def gather(study: Study, plan: Plan) -> list[Cell]:
         labels = {p.key: trial.params[p.key] for p in parameters if p.key in trial.params}
         values = {p.key: p.value(labels[p.key]) for p in parameters if p.key in labels}
         _take(cells.setdefault(tuple(map(str, labels.items())), Cell(values)), trial)
+    name_scenes(list(cells.values()))
     order = {p.key: p.example() for p in parameters}
     return sorted(cells.values(), key=lambda cell: [_rank(cell.values.get(key), order[key]) for key in order])
+
+
+def name_scenes(cells: Sequence[Cell]) -> None:
+    """Call folders of the same name by as much of their paths as tells them apart."""
+    cells = [cell for cell in cells if SCENE in cell.values]
+    paths = {path: Path(path).parts for cell in cells if isinstance(path := cell.values[SCENE], str)}
+    for length in range(1, 1 + max(map(len, paths.values()), default=0)):
+        names = {path: "/".join(parts[-length:]) for path, parts in paths.items()}
+        for cell in cells:
+            cell.names[SCENE] = names.get(cell.values[SCENE], named(cell.values[SCENE]))
+        if len(set(names.values())) == len(names):
+            return
 
 
 def _take(cell: Cell, trial: FrozenTrial) -> None:
@@ -90,7 +110,7 @@ def _is_number(value: Any) -> bool:
 def named(value: Any) -> str:
     """A setting's value as a figure or table shows it: a class without its module, a folder without the way to it."""
     if isinstance(value, str):
-        return value.rpartition("/" if "/" in value else ".")[2]
+        return Path(value).name if "/" in value else value.rpartition(".")[2]
     if isinstance(value, float):
         return f"{value:g}"
     if isinstance(value, list) and len(value) == 1:
@@ -115,7 +135,7 @@ def _rows(cells: Sequence[Cell], exhibit: Exhibit) -> tuple[list[str], list[list
     )
     rows = []
     for cell in cells:
-        row = [named(cell.values[key]) if key in cell.values else "" for key in keys]
+        row = [cell.names.get(key, "") for key in keys]
         row += [str(len(cell.metrics))] * several
         if cell.reason is not None and exhibit.table:
             row += [f"failed: {cell.reason}"] + [""] * (len(exhibit.table) - 1)
@@ -144,7 +164,7 @@ def as_table(cells: Sequence[Cell], exhibit: Exhibit, title: str) -> Table:
     for head in heads:
         table.add_column(head, justify="right", overflow="fold")
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*map(escape, row))  # a reason may have brackets
     return table
 
 

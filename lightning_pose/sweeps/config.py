@@ -119,7 +119,8 @@ def put(config: dict[str, Any], full: Mapping[str, Any], parts: Sequence[str], v
     if not rest:
         if head == "class_path" and "init_args" in config:
             config["init_args"] = {k: v for k, v in config["init_args"].items() if k in full.get("init_args", {})}
-        config[head] = copy.deepcopy(value)
+        # `--data.root 2024` is a folder, and not a number.
+        config[head] = full[head] if isinstance(full.get(head), str) else copy.deepcopy(value)
         return
     if not isinstance(config.get(head), dict):
         config[head] = {}

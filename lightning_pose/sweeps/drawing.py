@@ -15,8 +15,8 @@ from matplotlib.ticker import NullLocator
 from lightning_pose.clip_plots import CLIP_BASELINES
 from lightning_pose.images import read_rgb
 from lightning_pose.plots import BASELINES, MODEL, OTHERS, STYLE, log_axis
-from lightning_pose.sweeps.cells import Cell, named, varying
-from lightning_pose.sweeps.exhibit import Exhibit
+from lightning_pose.sweeps.cells import Cell, varying
+from lightning_pose.sweeps.exhibit import SCENE, Exhibit
 from lightning_pose.sweeps.features import FrameKeypoints
 
 __all__ = ["draw_cells", "draw_keypoints"]
@@ -72,16 +72,17 @@ def _lines(cells: Sequence[Cell], exhibit: Exhibit) -> Lines:
     apart = [key for key in varying(cells) if key != exhibit.x]
     lines: Lines = {}
     for cell in cells:
-        parts = [_told(key, cell.values[key], exhibit) for key in apart if key in cell.values]
+        parts = [_told(key, cell, exhibit) for key in apart if key in cell.values]
         lines.setdefault(", ".join(parts) or "model", []).append(cell)
     return lines
 
 
-def _told(key: str, value: Any, exhibit: Exhibit) -> str:
+def _told(key: str, cell: Cell, exhibit: Exhibit) -> str:
     """A setting in a legend: its value, and its name where that does not speak for itself."""
-    if key == "data.root":
-        return named(value) if value else "synthetic room"
-    return named(value) if isinstance(value, str) else f"{exhibit.label(key)} {named(value)}"
+    value = cell.values[key]
+    if key == SCENE and not value:
+        return "synthetic room"
+    return cell.names[key] if isinstance(value, str) else f"{exhibit.label(key)} {cell.names[key]}"
 
 
 def _settings(axes: Axes, lines: Lines, metric: str, exhibit: Exhibit) -> None:
@@ -92,7 +93,7 @@ def _settings(axes: Axes, lines: Lines, metric: str, exhibit: Exhibit) -> None:
     }
     width = 0.8 / max(len(labels) for labels in bars.values())
     for i, (label, cells) in enumerate(lines.items()):
-        held = [(places[named(cell.values.get(exhibit.x))], cell) for cell in cells if cell.all(metric)]
+        held = [(places[_at(cell, exhibit)], cell) for cell in cells if cell.all(metric)]
         x, y = [place for place, _ in held], [fmean(cell.all(metric)) for _, cell in held]
         color = COLORS[i % len(COLORS)]
         if exhibit.kind == "line":
@@ -113,14 +114,19 @@ def _settings(axes: Axes, lines: Lines, metric: str, exhibit: Exhibit) -> None:
     axes.set_xlabel(exhibit.label(exhibit.x))
 
 
+def _at(cell: Cell, exhibit: Exhibit) -> str:
+    """The name of a cell's place on the axis."""
+    return cell.names.get(exhibit.x, "none")
+
+
 def _has(cells: Sequence[Cell], exhibit: Exhibit, name: str) -> bool:
-    return any(named(cell.values.get(exhibit.x)) == name for cell in cells)
+    return any(_at(cell, exhibit) == name for cell in cells)
 
 
 def _places(lines: Lines, exhibit: Exhibit) -> dict[str, float | int]:
     """Where on the axis each value lies, by its name: numbers where they are, in a line, others in their order."""
-    held = [cell.values.get(exhibit.x) for cells in lines.values() for cell in cells]
-    values = {named(value): _plain(value) for value in held}
+    held = [cell for cells in lines.values() for cell in cells]
+    values = {_at(cell, exhibit): _plain(cell.values.get(exhibit.x)) for cell in held}
     if exhibit.kind == "line" and all(isinstance(v, int | float) and not isinstance(v, bool) for v in values.values()):
         return {name: float(value) for name, value in values.items()}
     return {name: i for i, name in enumerate(values)}
@@ -158,7 +164,7 @@ def _baselines(axes: Axes, lines: Lines, metric: str, exhibit: Exhibit, places: 
         name = _of_baseline(metric, baseline)
         at: dict[float, list[float]] = {}
         for cell in (cell for cells in lines.values() for cell in cells):
-            at.setdefault(places[named(cell.values.get(exhibit.x))], []).extend(cell.all(name))
+            at.setdefault(places[_at(cell, exhibit)], []).extend(cell.all(name))
         drawn = {place: fmean(values) for place, values in sorted(at.items()) if values}
         if drawn and name != metric:
             _draw_baseline(axes, baseline, drawn)

@@ -9,10 +9,10 @@ from typing import Any
 from lightning_pose.errors import ConfigError
 from lightning_pose.sweeps.space import Parameter, nearest
 
-__all__ = ["BASE", "MEASURES", "SEED", "Exhibit", "parse_exhibit"]
+__all__ = ["BASE", "MEASURES", "SCENE", "SEED", "Exhibit", "parse_exhibit"]
 
-BASE, SEED = "base", "seed_everything"
-"""Parameters with a part of their own: which base config a trial has, and what is averaged over."""
+BASE, SEED, SCENE = "base", "seed_everything", "data.root"
+"""Parameters with a part of their own: which base config a trial has, what is averaged over, and a folder."""
 
 MEASURES = {
     None: ("val/", "cost/"),
@@ -93,7 +93,7 @@ def parse_exhibit(raw: Any, measure: str | None, space: Sequence[Parameter]) -> 
         beside=_names(raw.get("beside", []), "beside"),
         title=raw.get("title"),
         table=table or (() if kind in ("curve", "pictures") else y),
-        labels={str(name): str(label) for name, label in (raw.get("labels") or {}).items()},
+        labels=_labels(raw.get("labels") or {}),
     )
 
 
@@ -106,6 +106,8 @@ def _axis(x: Any, kind: str, space: Sequence[Parameter]) -> str:
             )
         return ""
     name = str(x).replace(".init_args.", ".")
+    if f"{name}.class_path" in keys:
+        return f"{name}.class_path"
     if name not in keys:
         raise ConfigError(f"figure.x is {x}, which is not searched; {nearest(name, keys)}")
     return name
@@ -116,6 +118,12 @@ def _names(value: Any, field: str) -> tuple[str, ...]:
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise ConfigError(f"figure.{field} is {value!r}; give a list of names")
     return tuple(names)
+
+
+def _labels(raw: Any) -> dict[str, str]:
+    if not isinstance(raw, Mapping):
+        raise ConfigError(f"figure.labels are {raw!r}; give them by name, as {{model.layers: convolutions}}")
+    return {str(name): str(label) for name, label in raw.items()}
 
 
 SPELT = {

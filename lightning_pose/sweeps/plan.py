@@ -14,7 +14,7 @@ from lightning_pose.errors import ConfigError
 from lightning_pose.summary import summarize_errors
 from lightning_pose.sweeps.config import ParsedConfig, check_known, keys, options, put, read_yaml, resolve
 from lightning_pose.sweeps.exhibit import BASE, MEASURES, Exhibit, parse_exhibit
-from lightning_pose.sweeps.space import Parameter, nearest, parse_space
+from lightning_pose.sweeps.space import Parameter, by_class_path, check_when, nearest, parse_space
 from lightning_pose.tracking import default_tracking_uri
 
 __all__ = ["Objective", "Plan", "read_plan"]
@@ -22,6 +22,7 @@ __all__ = ["Objective", "Plan", "read_plan"]
 FIELDS = ("base", "objective", "sampler", "pruner", "n_trials", "seed", "settings", "space", "measure", "figure")
 COSTS = ("cost/parameters", "cost/layers", "cost/train_seconds", "cost/ms_per_frame", "cost/features_ms_per_frame")
 MEASURED = [f"val/{name}" for name in ("loss", *summarize_errors(np.zeros(1), np.zeros(1)))]
+SCENES = ("data.root", "data.train_scenes", "data.test_scenes", "data.room_seed", "data.train_rooms", "data.test_rooms")
 FEATURES = ("features/count_median", "features/count_mean")
 
 
@@ -80,6 +81,11 @@ class Plan:
         return "+".join(self.bases) if len(self.bases) > 1 else self.resolved["model"]["class_path"].rpartition(".")[2]
 
     @property
+    def comparable(self) -> bool:
+        """Whether one trial can be the best: features are not better or worse, and scenes are not equally hard."""
+        return self.measure != "features" and not any(p.key in SCENES for p in self.space)
+
+    @property
     def tracking(self) -> tuple[str, str]:
         """MLflow's address and experiment."""
         logger = self.resolved["trainer"]["logger"]["init_args"]
@@ -133,18 +139,20 @@ def read_plan(file: Path, overrides: Mapping[str, Any]) -> Plan:
             raise ConfigError(f"{file} has an unknown entry {field!r}; {nearest(str(field), FIELDS)}")
     bases = _find_bases(file, raw.get("base"))
     measure = raw.get("measure")
-    if measure not in MEASURES:
+    if not isinstance(measure, str | None) or measure not in MEASURES:
         raise ConfigError(f"measure is {measure!r}; give test or features, or leave it out")
-    settings = {str(key).replace(".init_args.", "."): value for key, value in (raw.get("settings") or {}).items()}
+    settings = _settings(raw.get("settings"))
     space = _space(raw.get("space"), bases, overrides)
-    settings |= {key: value for key, value in overrides.items() if not key.startswith("space.")}
-    settings, resolved = _check_keys(bases, settings, space)
+    searched = {parameter.key for parameter in space}
+    settings |= {k: value for k, value in overrides.items() if not k.startswith("space.") and k not in searched}
+    settings, configs, space = _check_keys(bases, settings, space)
+    resolved = configs[0]
+    alike = len({json.dumps(config["model"]["init_args"].get("loss"), default=str) for config in configs}) == 1
+    usual = FEATURES[0] if measure == "features" else "val/loss" if alike else "val/position_median_m"
     plan = Plan(
         file=file,
         bases=bases,
-        objectives=_parse_objectives(
-            raw.get("objective", FEATURES[0] if measure == "features" else "val/loss"), measure
-        ),
+        objectives=_parse_objectives(raw.get("objective", usual), measure),
         sampler=_named(raw.get("sampler", "tpe"), "sampler"),
         pruner=_named(raw.get("pruner", "none" if measure else "default"), "pruner"),
         n_trials=_whole(raw.get("n_trials"), "n_trials"),
@@ -155,13 +163,22 @@ def read_plan(file: Path, overrides: Mapping[str, Any]) -> Plan:
         exhibit=parse_exhibit(raw.get("figure"), measure, space),
         resolved=resolved,
     )
-    weighed = [p.key for p in space if p.key.startswith("model.loss")]
+    weighed = [p.key for p in space if p.key.startswith("model.loss")] + [BASE] * (not alike)
     if weighed and any(objective.metric == "val/loss" for objective in plan.objectives):
         raise ConfigError(f"objective val/loss means something else for each {weighed[0]}; take val/position_median_m")
-    if not str((resolved["trainer"]["logger"] or {}).get("class_path", "")).endswith("MLflowLogger"):
-        base = next(iter(bases.values()))
-        raise ConfigError(f"{base} has another trainer.logger, but a sweep keeps its trials in MLflow; leave it out")
+    for base, config in zip(bases.values(), configs, strict=True):
+        logger = config["trainer"]["logger"]
+        if not isinstance(logger, Mapping) or not str(logger.get("class_path")).endswith("MLflowLogger"):
+            raise ConfigError(
+                f"{base} has another trainer.logger, but a sweep keeps its trials in MLflow; leave it out"
+            )
     return plan
+
+
+def _settings(raw: Any) -> dict[str, Any]:
+    if not isinstance(raw, Mapping | None):
+        raise ConfigError(f"settings are {raw!r}; give them by name, as {{trainer.max_epochs: 10}}")
+    return {str(key).replace(".init_args.", "."): value for key, value in (raw or {}).items()}
 
 
 def _find_bases(file: Path, entry: Any) -> dict[str, Path]:
@@ -187,14 +204,19 @@ def _space(raw: Any, bases: Mapping[str, Path], overrides: Mapping[str, Any]) ->
     entries = (
         {str(key).replace(".init_args.", "."): entry for key, entry in raw.items()} if isinstance(raw, dict) else {}
     )
-    for key, value in overrides.items():
-        name = key.removeprefix("space.")
-        if name != key:
-            entries[name] = value
-        elif key in entries:
-            entries[key] = [value]
     if len(bases) > 1:
         entries = {BASE: list(bases), **entries}
+    if entries:  # as the file has it: narrowed, a parameter may lack what another waits for
+        check_when(parse_space(entries))
+    for key, value in overrides.items():
+        name = key.removeprefix("space.")
+        if name == key and key in entries:
+            value = [value]
+        elif name == key:
+            continue
+        before = entries.get(name)
+        keeps_when = isinstance(before, Mapping) and "when" in before and isinstance(value, list)
+        entries[name] = {"choices": value, "when": before["when"]} if keeps_when else value  # type: ignore[index]
     return parse_space(entries or raw)
 
 
@@ -238,22 +260,25 @@ def _parse_objective(entry: Any, known: Sequence[str]) -> Objective:
 
 def _check_keys(
     bases: Mapping[str, Path], settings: Mapping[str, Any], space: Sequence[Parameter]
-) -> tuple[dict[str, Any], dict[str, Any]]:
+) -> tuple[dict[str, Any], list[dict[str, Any]], list[Parameter]]:
     """Every key exists, in its base config or under a class that is searched, and has values of the right type.
 
     Returns:
-        The settings, a class by the name of its `class_path`, and the first base's whole config with them.
+        The settings and the space, a class by the name of its `class_path`, and each base's whole config.
     """
-    found = [_check_base(name, file, settings, [p for p in space if p.key != BASE]) for name, file in bases.items()]
-    return found[0]
+    found = {name: resolve(file, settings) for name, file in bases.items()}
+    known = set[str]().union(*(keys(resolved) for _, _, resolved in found.values()))
+    space = by_class_path(space, known)
+    for name, (cli, named, resolved) in found.items():
+        own = [p for p in space if p.key != BASE and name in (p.when or {}).get(BASE, (name,))]
+        _check_base(bases[name], cli, named, resolved, own)
+    return next(iter(found.values()))[1], [resolved for _, _, resolved in found.values()], space
 
 
 def _check_base(
-    name: str, base: Path, settings: Mapping[str, Any], space: Sequence[Parameter]
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    cli, named, resolved = resolve(base, settings)
+    base: Path, cli: ParsedConfig, named: Mapping[str, Any], resolved: Mapping[str, Any], own: Sequence[Parameter]
+) -> None:
     known = keys(cli.config.as_dict()) | keys(resolved)
-    own = [parameter for parameter in space if name in (parameter.when or {}).get(BASE, (name,))]
     classes = [parameter for parameter in own if parameter.key.endswith(".class_path")]
     for parameter in classes:
         for choice in parameter.example():
@@ -267,4 +292,3 @@ def _check_base(
                 cli.parse(["--config", str(base), *options({**named, parameter.key: value})])
             except ConfigError as error:
                 raise ConfigError(f"space.{parameter.key} cannot be {value!r}: {error}") from error
-    return named, resolved

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import yaml
 from optuna import Study
 from optuna.trial import FrozenTrial, TrialState
+from rich.markup import escape
 from rich.table import Table
 
-from lightning_pose.sweeps.cells import as_csv, as_markdown, as_table, gather, varying
+from lightning_pose.errors import ConfigError
+from lightning_pose.sweeps.cells import Cell, as_csv, as_markdown, as_table, gather, varying
 from lightning_pose.sweeps.config import ParsedConfig
 from lightning_pose.sweeps.drawing import draw_cells, draw_keypoints
+from lightning_pose.sweeps.exhibit import SCENE, Exhibit
 from lightning_pose.sweeps.features import keypoints_of_a_frame
 from lightning_pose.sweeps.plan import Objective, Plan
+from lightning_pose.sweeps.space import nearest
 from lightning_pose.sweeps.trial import REASON
 
 __all__ = [
@@ -77,10 +81,10 @@ def table(study: Study, plan: Plan) -> Table:
         shown.add_column(name, justify="right", overflow="fold")
     for trial in best_trials(study, plan)[:SHOWN]:
         params = [short(trial.params.get(key, "")) for key in keys]
-        shown.add_row(str(trial.number), *(f"{value:.4g}" for value in trial.values), *params)
+        shown.add_row(str(trial.number), *(f"{value:.4g}" for value in trial.values), *map(escape, params))
     failed = [t for t in study.get_trials(deepcopy=False, states=(TrialState.FAIL,)) if REASON in t.user_attrs]
     if failed:
-        shown.caption = f"trial {failed[-1].number} failed: {failed[-1].user_attrs[REASON]}"
+        shown.caption = f"trial {failed[-1].number} failed: {escape(failed[-1].user_attrs[REASON])}"
     return shown
 
 
@@ -95,24 +99,45 @@ def show_study(study: Study, plan: Plan, folder: Path) -> tuple[list[Path], Tabl
 
     Returns:
         The files, and the table for the terminal; none for pictures, which have no numbers.
+
+    Raises:
+        ConfigError: it is to show what no trial has measured.
     """
     exhibit = plan.exhibit
     if exhibit is None:
         return [], None
     cells = gather(study, plan)
+    _check_measured(cells, exhibit)
     title = exhibit.title or study.study_name
-    if "data.root" not in varying(cells):  # where it does, the scenes are named beside their curves
+    if SCENE not in varying(cells):  # where it does, the scenes are named beside their curves
         title = f"{title}, {plan.scene}"
     figure = folder / "figure.png"
     if exhibit.kind == "pictures":
-        shown = [ParsedConfig(plan.arguments(cell.values)) for cell in cells if cell.metrics]
-        frames = [keypoints_of_a_frame(config) for config in shown]
-        draw_keypoints({frame.scene: frame for frame in frames}, title).savefig(figure)
+        shown = [cell for cell in cells if cell.metrics]
+        frames = [keypoints_of_a_frame(ParsedConfig(plan.arguments(cell.values))) for cell in shown]
+        names = [
+            cell.names[SCENE] if cell.values.get(SCENE) else frame.scene
+            for cell, frame in zip(shown, frames, strict=True)
+        ]
+        draw_keypoints(dict(zip(names, frames, strict=True)), title).savefig(figure)
     else:
         draw_cells(cells, exhibit, title).savefig(figure)
     (folder / "table.csv").write_text(as_csv(cells, plan))
     (folder / "table.md").write_text(as_markdown(cells, exhibit))
     return [figure, folder / "table.csv", folder / "table.md"], as_table(cells, exhibit, title)
+
+
+def _check_measured(cells: Sequence[Cell], exhibit: Exhibit) -> None:
+    held = [found for cell in cells for found in (*cell.metrics, *cell.curves)]
+    known = sorted(set[str]().union(*held))
+    baselines = sorted({name.split("/")[1] for name in known if name.startswith("baseline/")})
+    again = "correct the file, and the same command draws what there is"
+    for name in (*exhibit.y, *exhibit.table):
+        if name not in known:
+            raise ConfigError(f"figure shows {name}, which no trial has measured ({nearest(name, known)}); {again}")
+    for name in exhibit.beside:
+        if name not in baselines:
+            raise ConfigError(f"figure.beside has {name}, which is no baseline ({nearest(name, baselines)}); {again}")
 
 
 def short(value: Any) -> str:
@@ -149,13 +174,18 @@ def _figures(study: Study, plan: Plan) -> Iterator[tuple[str, Callable[[], Any]]
 
     done = completed(study)
     for i, objective in enumerate(plan.objectives):
-        named = {"target_name": objective.metric, "target": lambda trial, i=i: trial.values[i]}
+        named: dict[str, Any] = {"target_name": objective.metric}
+        weighed = named
+        if len(plan.objectives) > 1:  # with one, Optuna knows which way is better, and draws the best so far
+            named = named | {"target": lambda trial, i=i: trial.values[i]}
+            sign = -1 if objective.maximize else 1  # what matters for the best trials, which it takes for the lowest
+            weighed = named | {"target": lambda trial, i=i, sign=sign: sign * trial.values[i]}
         end = f"_{_file_name(objective)}" if len(plan.objectives) > 1 else ""
         yield f"history{end}", lambda named=named: draw.plot_optimization_history(study, **named)
         yield f"slice{end}", lambda named=named: draw.plot_slice(study, **named)
         yield f"parallel_coordinate{end}", lambda named=named: draw.plot_parallel_coordinate(study, **named)
         if len({trial.values[i] for trial in done}) > 1:
-            yield f"importance{end}", lambda named=named: draw.plot_param_importances(study, **named)
+            yield f"importance{end}", lambda named=weighed: draw.plot_param_importances(study, **named)
     if len(plan.objectives) in (2, 3):
         names = [objective.metric for objective in plan.objectives]
         yield "pareto_front", lambda: draw.plot_pareto_front(study, target_names=names)

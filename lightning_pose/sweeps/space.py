@@ -5,8 +5,8 @@ from __future__ import annotations
 import itertools
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +17,7 @@ from lightning_pose.errors import ConfigError
 if TYPE_CHECKING:
     from optuna import Trial
 
-__all__ = ["Parameter", "draw", "grid", "nearest", "parse_space"]
+__all__ = ["Parameter", "by_class_path", "check_when", "draw", "grid", "nearest", "parse_space"]
 
 Scalar = str | int | float | bool | None
 
@@ -60,8 +60,7 @@ class Parameter:
             return self.choices[trial.suggest_categorical(self.key, list(self.choices))]
         if self.kind == "int":
             return trial.suggest_int(self.key, int(self.low), int(self.high), step=int(self.step or 1), log=self.log)
-        drawn = trial.suggest_float(self.key, self.low, self.high, step=self.step, log=self.log)
-        return drawn if self.step is None else float(f"{drawn:.12g}")  # three steps of 0.1 are 0.3 to a reader
+        return self.value(trial.suggest_float(self.key, self.low, self.high, step=self.step, log=self.log))
 
     def grid_labels(self) -> list[Scalar]:
         """Every value, as Optuna stores it.
@@ -75,11 +74,15 @@ class Parameter:
             raise ConfigError(f"{self.key} has no step, so a grid has no end; give it a step, or choices")
         step = self.step or 1
         values = [self.low + i * step for i in range(math.floor((self.high - self.low) / step + 1e-9) + 1)]
-        return [int(value) if self.kind == "int" else float(value) for value in values]
+        return [int(value) if self.kind == "int" else self.value(float(value)) for value in values]
 
     def value(self, label: Scalar) -> Any:
         """What a stored label stands for in the config."""
-        return label if self.choices is None else self.choices[label]
+        if self.choices is not None:
+            return self.choices[label]
+        if self.step is None or not isinstance(label, float):
+            return label
+        return min(float(f"{label:.12g}"), self.high)  # three steps of 0.1 are 0.3 to a reader, and not beyond 0.3
 
     def example(self) -> list[Any]:
         """Values to try against the config: all choices, or both ends."""
@@ -171,17 +174,35 @@ def _parse_when(key: str, when: Any) -> dict[str, tuple[Any, ...]]:
     }
 
 
+def check_when(space: Sequence[Parameter]) -> None:
+    """Refuse a `when` that no trial could fulfil.
+
+    Raises:
+        ConfigError: it names a value that is none of the other parameter's choices.
+    """
+    choices = {parameter.key: list(parameter.choices.values()) for parameter in space if parameter.choices}
+    for parameter in space:
+        for key, wanted in (parameter.when or {}).items():
+            for value in wanted:
+                if key in choices and value not in choices[key]:
+                    raise ConfigError(
+                        f"space.{parameter.key} has when {key} is {value!r}; {nearest(str(value), choices[key])}"
+                    )
+
+
 def _label(choice: Any) -> Scalar:
     return choice if choice is None or isinstance(choice, str | int | float | bool) else json.dumps(choice)
 
 
-def _ordered(parameters: Mapping[str, Parameter]) -> list[Parameter]:
-    for parameter in parameters.values():
-        for key in parameter.when or {}:
+def _ordered(parameters: dict[str, Parameter]) -> list[Parameter]:
+    for name, parameter in parameters.items():
+        when = dict(parameter.when or {})
+        for key, wanted in when.items():
             if key not in parameters:
-                raise ConfigError(
-                    f"space.{parameter.key} has when {key}, which is not searched; {nearest(key, list(parameters))}"
-                )
+                raise ConfigError(f"space.{name} has when {key}, which is not searched; {nearest(key, parameters)}")
+            if list(wanted) in (parameters[key].choices or {}).values():
+                when[key] = (list(wanted),)  # one choice that is a list, and not several
+        parameters[name] = replace(parameter, when=when)
     ordered: list[Parameter] = []
     left = list(parameters.values())
     while left:
@@ -193,6 +214,19 @@ def _ordered(parameters: Mapping[str, Parameter]) -> list[Parameter]:
         ordered.append(ready[0])
         left.remove(ready[0])
     return ordered
+
+
+def by_class_path(space: Sequence[Parameter], known: Container[str]) -> list[Parameter]:
+    """The space with classes by the name of their `class_path`, as `data.extractor.class_path` for `data.extractor`."""
+    names = {
+        parameter.key: f"{parameter.key}.class_path"
+        for parameter in space
+        if f"{parameter.key}.class_path" in known and all(isinstance(value, str) for value in parameter.example())
+    }
+    return [
+        replace(p, key=names.get(p.key, p.key), when={names.get(k, k): wanted for k, wanted in (p.when or {}).items()})
+        for p in space
+    ]
 
 
 def draw(trial: Trial, space: Sequence[Parameter]) -> dict[str, Any]:
@@ -232,8 +266,9 @@ def _cells(space: Sequence[Parameter]) -> Iterator[dict[str, Scalar]]:
         yield cell
 
 
-def nearest(name: str, known: Sequence[str]) -> str:
+def nearest(name: str, known: Iterable[Any]) -> str:
     """The remedy for a mistyped name."""
+    known = list(map(str, known))
     near = get_close_matches(name, known, n=1, cutoff=0.5)
     if not near:  # a dotted name may be right in its last part alone
         last = name.rpartition(".")[2]
