@@ -21,8 +21,10 @@ SEVEN_SCENES = ("chess", "fire", "heads", "office", "pumpkin", "redkitchen", "st
 POSITION, ORIENTATION = "position_median_m", "orientation_median_deg"
 COSTS = ("parameters", "train_seconds", "ms_per_frame", "features_ms_per_frame", "frame_bytes", "checkpoint_bytes")
 SKILLS = ("skill_position", "skill_orientation")
-BY_SCENE = ("data.root", "data.format", "data.room_seed", "data.train_scenes", "data.test_scenes", "data.train_rooms",
-            "data.test_rooms")  # fmt: skip
+BY_SCENE = (
+    "scene", "data.root", "data.format", "data.room_seed", "data.train_scenes", "data.test_scenes", "data.train_rooms",
+    "data.test_rooms",
+)  # fmt: skip
 
 UNTOLD = "not told"
 

@@ -181,6 +181,8 @@ def test_a_row_with_other_settings_in_other_scenes_says_so(table) -> None:
         FakeRun(scene="fire", params={"model.units": "200", "data.root": "b"}),
     )
     assert "SurfLSTM has other settings in other scenes: model.units (100, 200)" in report.notes
+    alike = table(FakeRun(), FakeRun(scene="fire"))
+    assert not any("other settings" in note for note in alike.notes), "another scene is no other setting"
 
 
 def test_costs_and_skill_are_means_over_scenes(table) -> None:
