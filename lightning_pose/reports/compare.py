@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from lightning_pose.errors import ConfigError
 from lightning_pose.reports.store import Run
 
-__all__ = ["FACTS", "column_facts", "describe_facts", "differing_settings", "missing_facts"]
+__all__ = ["FACTS", "column_facts", "describe_facts", "differing_settings", "missing_facts", "tested"]
 
 FACTS = (
     "task",
@@ -98,6 +98,15 @@ def describe_facts(facts: Mapping[str, str]) -> str:
     if facts.get("unit", "m") != "m":
         parts.append("positions in units of the scene, not metres")
     return ", ".join(parts) or "nothing told of split and ground truth"
+
+
+def tested(scene: str, facts: Mapping[str, str], fact: str) -> str | None:
+    """A fact of the scene that a column's errors are of: of `den to chess`, trained in one and tested in the other, a
+    run tells the ground truth `synthetic+original`."""
+    told = facts.get(fact)
+    if told is None or "+" in scene.rpartition(" to ")[2]:
+        return told
+    return told.rpartition("+")[2]
 
 
 def differing_settings(runs: Iterable[Run], ignore: Iterable[str] = ()) -> dict[str, list[str]]:
