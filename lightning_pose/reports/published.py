@@ -110,8 +110,7 @@ def _known(report: Report, scene: str) -> str | None:
     truth = GROUND_TRUTHS.get(tested(scene, facts, "dataset") or "7scenes")
     if truth is None or (tested(scene, facts, "ground_truth") or truth) != truth:
         return None
-    letters = re.sub(r"[^a-z]", "", scene.rpartition(" to ")[2].lower())
-    return SCENES.get(letters)
+    return SCENES.get(re.sub("[ _-]", "", scene.rpartition(" to ")[2].lower()))
 
 
 def _merge(rows: list[Row], published: Published, cells: dict[str, Cell]) -> None:

@@ -145,6 +145,13 @@ def test_other_data_of_the_same_name_has_no_published_rows(facts: dict[str, str]
     assert "no published row: none of the scenes on show (office)" in report.notes[0]
 
 
+def test_a_folder_of_another_scene_is_not_taken_for_a_published_one() -> None:
+    others = ("office-2", "chess_2", "heads3", "2chess", "my_office")
+    report = report_on(*others, "Red Kitchen", "red_kitchen", "red-kitchen")
+    add_published(report, [2])
+    assert {scene for row in report.rows for scene in row.cells} == {"Red Kitchen", "red_kitchen", "red-kitchen"}
+
+
 def test_means_stand_beside_the_seven_scenes_alone() -> None:
     whole, part = report_on(*SEVEN), report_on(*SEVEN[:6])
     for report in (whole, part):
