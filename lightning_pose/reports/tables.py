@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -245,4 +244,12 @@ def _scene_order(scene: str) -> tuple[int, str]:
 
 def _row_order(key: tuple[str, ...]) -> list[tuple[int, float, str]]:
     """By name, numbers as numbers."""
-    return [(0, float(part), "") if re.fullmatch(r"-?[\d.]+(e-?\d+)?", part) else (1, 0.0, part) for part in key]
+    return [_sortable(part) for part in key]
+
+
+def _sortable(text: str) -> tuple[int, float, str]:
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    return (1, 0.0, text) if math.isnan(number) else (0, number, text)

@@ -127,6 +127,12 @@ def test_rows_by_settings_in_the_order_of_numbers(table) -> None:
         table(*runs, by=("neighbors",))
 
 
+def test_settings_that_only_look_like_numbers_are_text(table) -> None:
+    values = ("2.6.6", "1e-3", "nan", "10", "2", ".5", "-")
+    report = table(*(FakeRun(params={"version": value}) for value in values), by=("version",))
+    assert [row.settings["version"] for row in report.rows] == ["1e-3", ".5", "2", "10", "-", "2.6.6", "nan"]
+
+
 @pytest.mark.parametrize(
     ("fact", "other"),
     [
