@@ -32,11 +32,11 @@ degrees on the test frames, and the mean over the scenes, out of the runs that `
 
 RULES = """Several runs of a system on a scene are joined by --pick:
 
-  best     the run with the lowest validation error (val/position_median_m, else val/loss, of its best epoch). Test
-           errors never choose. Where no run has one, the newest.
+  best     the run with the lowest validation error (val/position_median_m, else val/loss, of its best epoch, or of its
+           last where it does not tell that one). Test errors never choose. Where no run has one, the newest.
   latest   the newest run
-  spread   mean and standard deviation over runs that differ in nothing but seed_everything; others are refused, or
-           get rows of their own with --by NAME
+  spread   mean and standard deviation over runs that differ in nothing but seed_everything (and in the folder of the
+           same data); others are refused, or get rows of their own with --by NAME
 
 Runs of a scene must agree in what they were tested on: task (absolute poses of images, or relative poses of clips),
 dataset, split, ground_truth, unit, image_size, test_frames, and for clips clip_length, stride and relative_frame.

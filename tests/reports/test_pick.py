@@ -31,6 +31,17 @@ def test_best_is_by_the_best_epoch_where_a_run_tells_it(table) -> None:
     assert shown(report) == {"SurfLSTM": {"chess": 0.9}}
 
 
+def test_the_rule_tells_how_many_runs_know_only_their_last_epoch(table) -> None:
+    known = {"best/val/position_median_m": 0.1}
+    runs = [FakeRun(metrics=known), FakeRun(val=0.2), FakeRun(scene="fire", val=0.3)]
+    says = "the run that is best by val/position_median_m of its best epoch"
+    assert table(*runs).rule == (
+        f"of each system and scene, {says} (of its last, for 2 of 3 runs that do not tell their best); "
+        "never by test errors"
+    )
+    assert table(runs[0]).rule == f"of each system and scene, {says}; never by test errors"
+
+
 def test_best_falls_back_to_the_loss_and_then_to_the_newest(table) -> None:
     by_loss = table(
         FakeRun(test=(0.1, 1.0), val=None, metrics={"val/loss": 2.0}, day=3),
@@ -71,6 +82,33 @@ def test_spread_takes_the_newest_of_each_seed_and_no_test_runs(table) -> None:
     assert shown(report) == {"SurfLSTM": {"chess": pytest.approx(0.2)}}
     assert "SurfLSTM on chess: 3 runs have 2 seeds; the newest of each counts" in report.notes
     assert any("1 runs of `test` are left out" in note for note in report.notes)
+
+
+def test_spread_counts_each_run_without_a_seed(table) -> None:
+    """Whose seed the store tells as the text None."""
+    runs = [FakeRun(test=(value, 1.0), params={"seed": "None"}) for value in (0.1, 0.2, 0.6)]
+    report = table(*runs, pick="spread")
+    (cell,) = report.rows[0].cells.values()
+    assert (len(cell.runs), cell.position_m) == (3, pytest.approx(0.3))
+    assert not any("seeds" in note for note in report.notes)
+
+
+def test_spread_takes_one_scene_for_the_same_in_any_folder(table) -> None:
+    """Where its name, its split and its test frames agree."""
+
+    def runs(**tags: str | None) -> list[FakeRun]:
+        folders = ("chess", "/data/7scenes/chess")
+        return [
+            FakeRun(tags=tags, params={"seed": f, "data.root": f, "data.train_scenes": f"['{f}']"}) for f in folders
+        ]
+
+    report = table(*runs(test_frames="2000"), pick="spread")
+    (cell,) = report.rows[0].cells.values()
+    assert len(cell.runs) == 2
+    says = "runs name data.root, data.train_scenes in several ways; taken for the same data, as scene, split and"
+    assert any(says in note for note in report.notes), report.notes
+    with pytest.raises(ConfigError, match=r"differ in data.root \(/data/7scenes/chess, chess\)"):
+        table(*runs(), pick="spread")
 
 
 def test_spread_refuses_runs_that_differ_in_more_than_the_seed(table) -> None:
