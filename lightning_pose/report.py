@@ -16,7 +16,8 @@ __all__ = ["main"]
 FORMATS = {"table": ".txt", "markdown": ".md", "latex": ".tex", "csv": ".csv", "json": ".json"}
 
 HELP = """A table of systems (rows) by scenes (columns), median position error in metres / median orientation error in
-degrees on the test frames, and the mean over the scenes, out of the runs that `fit` and `test` have left in MLflow.
+degrees on the test frames, and the mean over the scenes of each dataset, out of the runs that `fit` and `test` have
+left in MLflow.
 
   everything               report
   beside published rows    report --published --baselines

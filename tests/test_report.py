@@ -70,7 +70,7 @@ def test_markdown(capsys: pytest.CaptureFixture[str]) -> None:
     out, err = printed(capsys, "--format", "markdown", "--published", "--chapter", "3")
     lines = out.splitlines()
     assert lines[:4] == [
-        "| system | features | redkitchen | my_room | mean of scenes |",
+        "| system | features | redkitchen | my_room | mean |",
         "| --- | --- | ---: | ---: | ---: |",
         "| NodePose | cnn | **0.098** / 6.50 | – | 0.098 / 6.50 [1 of 2] |",
         "| SurfLSTM | surf | 0.187 / **6.30** | 0.251 / 8.00 | 0.219 / 7.15 |",
@@ -83,7 +83,7 @@ def test_markdown(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.usefixtures("uri")
 def test_latex(capsys: pytest.CaptureFixture[str]) -> None:
     out, err = printed(capsys, "--format", "latex", "--published", "--chapter", "3")
-    assert r"system & features & redkitchen & my\_room & mean of scenes \\" in out
+    assert r"system & features & redkitchen & my\_room & mean \\" in out
     assert r"NodePose & cnn & \textbf{0.098} / 6.50 & -- & 0.098 / 6.50 [1 of 2] \\" in out
     assert r"SurfCNN $^{\dagger}$ & table 3.2 & 0.37 / 10.25" in out
     assert r"{\footnotesize $^{\dagger}$ published, not measured here" in out
@@ -118,7 +118,7 @@ def test_json_has_everything(capsys: pytest.CaptureFixture[str]) -> None:
     assert [scene["name"] for scene in report["scenes"]] == ["redkitchen", "my_room"]
     assert report["scenes"][0]["test_frames"] == "150"
     lstm = next(row for row in report["rows"] if row["system"] == "SurfLSTM")
-    assert lstm["mean_of_scenes"] == {
+    assert lstm["means"]["mean"] == {
         "position_median_m": pytest.approx(0.219), "orientation_median_deg": pytest.approx(7.15), "scenes": 2,
     }  # fmt: skip
     (run,) = lstm["cells"]["redkitchen"]["runs"]

@@ -10,7 +10,7 @@ from typing import Any
 
 from lightning_pose.reports.render import HEADINGS
 from lightning_pose.reports.store import Run
-from lightning_pose.reports.tables import SKILLS, Cell, Report, Row
+from lightning_pose.reports.tables import SKILLS, Cell, Mean, Report, Row
 
 __all__ = ["as_csv", "as_json"]
 
@@ -56,22 +56,24 @@ def as_json(report: Report) -> str:
 
 
 def _row(row: Row) -> dict[str, Any]:
-    mean = row.mean
     return {
         "kind": row.kind,
         "system": row.system,
         "features": None if row.kind == "published" else row.features,
         "settings": dict(row.settings),
         "cells": {scene: _cell(cell) for scene, cell in row.cells.items()},
-        "mean_of_scenes": mean
-        and {
-            "position_median_m": _finite(mean.position_m),
-            "orientation_median_deg": _finite(mean.orientation_deg),
-            "scenes": mean.scenes,
-        },
+        "means": {column: _mean(mean) for column, mean in row.means.items()},
         "skill": {name: _finite(value) for name, value in row.skill.items()},
         "costs": {name: _finite(value) for name, value in row.costs.items()},
         "source": row.source or None,
+    }
+
+
+def _mean(mean: Mean) -> dict[str, Any]:
+    return {
+        "position_median_m": _finite(mean.position_m),
+        "orientation_median_deg": _finite(mean.orientation_deg),
+        "scenes": mean.scenes,
     }
 
 

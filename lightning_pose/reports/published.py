@@ -130,18 +130,20 @@ def _values(cells: dict[str, Cell]) -> dict[str, tuple[float, float | None]]:
 
 def _means(report: Report, columns: dict[str, str]) -> list[Row]:
     """Means over the seven scenes, which stand beside means over just these."""
+    absolute = {scene for scene in columns if report.facts[scene].get("task", "absolute") == "absolute"}
     seven = set(list(SCENES.values())[:SEVEN])
-    if any(facts.get("task", "absolute") != "absolute" for facts in report.facts.values()):
-        return []
-    if set(columns.values()) != seven or len(report.scenes) != SEVEN:
+    for column, scenes in report.means.items():
+        if len(scenes) == SEVEN and {columns[scene] for scene in scenes if scene in absolute} == seven:
+            return [_row_of_mean(column, *published) for published in MEANS]
+    if absolute:
         report.notes.append("published means over the seven scenes are left out: other scenes, or fewer, are on show")
-        return []
-    rows = []
-    for system, source, text in MEANS:
-        cell = _cell(text)
-        mean = Mean(cell.position_m, cell.orientation_deg, SEVEN)
-        rows.append(Row("published", system, source, {}, mean=mean, source=source))
-    return rows
+    return []
+
+
+def _row_of_mean(column: str, system: str, source: str, text: str) -> Row:
+    cell = _cell(text)
+    mean = Mean(cell.position_m, cell.orientation_deg, SEVEN)
+    return Row("published", system, source, {}, means={column: mean}, source=source)
 
 
 def _comparable(report: Report, columns: dict[str, str]) -> str:

@@ -19,7 +19,7 @@ def test_rows_are_systems_and_columns_scenes(table) -> None:
     )
     assert report.scenes == ["chess", "stairs", "office_b"]
     assert shown(report) == {"NodePose": {"chess": 0.2}, "SurfLSTM": {"chess": 0.1, "stairs": 0.3, "office_b": 0.5}}
-    node, lstm = (row.mean for row in report.rows)
+    node, lstm = (row.means["mean"] for row in report.rows)
     assert (lstm.position_m, lstm.orientation_deg, lstm.scenes) == (pytest.approx(0.3), pytest.approx(8.0), 3)
     assert (node.position_m, node.orientation_deg, node.scenes) == (0.2, 7.0, 1)
     assert any(note.startswith("a mean marked [k of n]") for note in report.notes)
@@ -84,13 +84,76 @@ def test_what_old_runs_do_not_tell_is_told(table) -> None:
                                "150 test frames"]  # fmt: skip
 
 
-def test_no_mean_over_units_or_tasks(table) -> None:
-    report = table(FakeRun(), FakeRun(scene="fox", tags={"unit": "scene"}))
-    assert report.rows[0].mean is None
-    assert "scenes differ in unit or task: no mean over them" in report.notes
-    mixed = table(FakeRun(), FakeRun(scene="den", tags={"split": "blocks"}))
-    assert mixed.rows[0].mean is not None
-    assert "scenes differ in split: the mean over them mixes the two" in mixed.notes
+CLIPS = {"task": "relative", "clip_length": "10", "stride": "1", "relative_frame": "camera"}
+
+
+@pytest.mark.parametrize(
+    ("fact", "other"), [("unit", "scene"), ("task", "absolute"), ("relative_frame", "world")], ids=str
+)
+def test_no_mean_over_what_does_not_add_up(table, fact: str, other: str) -> None:
+    report = table(FakeRun(tags=CLIPS), FakeRun(scene="den", tags={**CLIPS, fact: other}))
+    assert report.rows[0].means == {}
+    told = f"scenes differ in {fact.replace('_', ' ')}: no mean over them"
+    assert [note for note in report.notes if "scenes differ" in note] == [told]
+
+
+@pytest.mark.parametrize(
+    ("fact", "other"),
+    [
+        ("split", "blocks"),
+        ("ground_truth", "sfm"),
+        ("image_size", "320x240"),
+        ("clip_length", "100"),
+        ("stride", "2"),
+    ],
+)
+def test_a_mean_over_mixed_scenes_says_so(table, fact: str, other: str) -> None:
+    report = table(FakeRun(tags=CLIPS), FakeRun(scene="den", tags={**CLIPS, fact: other}))
+    assert report.rows[0].means["mean"].scenes == 2
+    told = f"scenes differ in {fact.replace('_', ' ')}: the mean over them mixes the two"
+    assert [note for note in report.notes if "scenes differ" in note] == [told]
+
+
+def test_errors_of_scenes_tested_alike_mix_wherever_the_network_was_trained(table) -> None:
+    rooms = {"dataset": "tum+7scenes", "ground_truth": "synthetic+original"}
+    report = table(
+        FakeRun(scene="heads to chess", tags={**CLIPS, "split": "unseen"}),
+        FakeRun(scene="den to chess", tags={**CLIPS, "split": "unseen", **rooms}),
+    )
+    assert list(report.means) == ["mean"]
+    assert not any("scenes differ" in note for note in report.notes)
+
+
+def test_a_mean_for_each_dataset(table) -> None:
+    outdoors = {"dataset": "cambridge", "ground_truth": "sfm", "image_size": "1920x1080"}
+    report = table(
+        FakeRun(test=(0.1, 8.0)),
+        FakeRun(scene="fire", test=(0.3, 6.0)),
+        FakeRun(scene="KingsCollege", test=(2.0, 3.0), tags=outdoors),
+        FakeRun(scene="OldHospital", test=(4.0, 5.0), tags=outdoors),
+        FakeRun("NodePose", "ShopFacade", test=(1.0, 4.0), tags=outdoors),
+    )
+    outside = ["KingsCollege", "OldHospital", "ShopFacade"]
+    assert report.means == {"mean 7scenes": ["chess", "fire"], "mean cambridge": outside}
+    node, lstm = report.rows
+    assert {column: mean.scenes for column, mean in node.means.items()} == {"mean cambridge": 1}
+    errors = {column: (mean.position_m, mean.orientation_deg) for column, mean in lstm.means.items()}
+    assert errors == {"mean 7scenes": (pytest.approx(0.2), 7.0), "mean cambridge": (3.0, 4.0)}
+    assert not any("scenes differ" in note for note in report.notes), "each mean is of scenes measured alike"
+
+
+def test_one_datasets_units_leave_the_mean_of_another(table) -> None:
+    report = table(
+        FakeRun(),
+        FakeRun(scene="fox", tags={"dataset": "nerf", "unit": "scene"}),
+        FakeRun(scene="barn", tags={"dataset": "nerf"}),
+        FakeRun(scene="den", tags={"dataset": None}),
+    )
+    assert report.means == {"mean 7scenes": ["chess"], "mean nerf": ["barn", "fox"], "mean unknown": ["den"]}
+    assert list(report.rows[0].means) == ["mean 7scenes", "mean unknown"]
+    assert "scenes of nerf differ in unit: no mean over them" in report.notes
+    alone = table(FakeRun(), FakeRun(scene="den", tags={"dataset": None}))
+    assert alone.means == {"mean": ["chess", "den"]}, "what is not told is taken to match"
 
 
 def test_a_row_with_other_settings_in_other_scenes_says_so(table) -> None:
@@ -132,8 +195,7 @@ def test_baselines_by_their_features(table) -> None:
         ("oracle", ""),
     ]
     assert rows[0].cells["fire"].orientation_deg == 5.0
-    assert rows[0].mean is not None
-    assert rows[0].mean.position_m == pytest.approx(0.35)
+    assert rows[0].means["mean"].position_m == pytest.approx(0.35)
 
 
 def test_baselines_that_differ_say_whose_they_are(table) -> None:
