@@ -45,7 +45,7 @@ Where they do not, nothing is shown until one is chosen, as in --tag task=absolu
 tags (features, split, task, git_commit) and of settings as fit has them (model.units, data.extractor.n_features,
 seed_everything). Only finished runs count, and trials of sweeps only with --trials.
 
-CSV is tidy, a line a system and scene; its notes, as those of LaTeX, go to standard error as well."""
+CSV is tidy, a line a system and scene, and one a mean; its notes, as those of LaTeX, go to standard error."""
 
 
 def main(argv: list[str]) -> int:

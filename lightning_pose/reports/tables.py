@@ -13,7 +13,7 @@ from lightning_pose.reports.pick import Choice, Pick, pick_runs
 from lightning_pose.reports.select import check_setting, setting
 from lightning_pose.reports.store import Run
 
-__all__ = ["COSTS", "MEAN", "SEVEN_SCENES", "Cell", "Mean", "Report", "Row", "add_means", "build_report"]
+__all__ = ["COSTS", "MEAN", "SEVEN_SCENES", "Cell", "Mean", "Report", "Row", "add_means", "build_report", "over_scenes"]
 
 SEVEN_SCENES = ("chess", "fire", "heads", "office", "pumpkin", "redkitchen", "stairs")
 
@@ -227,8 +227,8 @@ def _row(key: tuple[str, ...], by: Sequence[str], groups: Mapping[str, list[Run]
         features=features,
         cells=cells,
         settings=settings,
-        costs=_over_scenes(cells, {name: f"cost/{name}" for name in COSTS}),
-        skill=_over_scenes(cells, {name: f"test/{name}" for name in SKILLS}),
+        costs=over_scenes(cells, {name: f"cost/{name}" for name in COSTS}),
+        skill=over_scenes(cells, {name: f"test/{name}" for name in SKILLS}),
     )
 
 
@@ -252,7 +252,7 @@ def _std(values: Sequence[float]) -> float:
     return statistics.stdev(values) if all(map(math.isfinite, values)) else math.nan
 
 
-def _over_scenes(cells: Mapping[str, Cell], metrics: Mapping[str, str]) -> dict[str, float]:
+def over_scenes(cells: Mapping[str, Cell], metrics: Mapping[str, str]) -> dict[str, float]:
     """Mean over the scenes of the mean over a cell's runs, of each metric that all of them have."""
     found = {}
     for name, metric in metrics.items():
