@@ -86,7 +86,7 @@ def test_latex(capsys: pytest.CaptureFixture[str]) -> None:
     assert r"system & features & redkitchen & my\_room & mean \\" in out
     assert r"NodePose & cnn & \textbf{0.098} / 6.50 & -- & 0.098 / 6.50 [1 of 2] \\" in out
     assert r"SurfCNN $^{\dagger}$ & table 3.2 & 0.37 / 10.25" in out
-    assert r"{\footnotesize $^{\dagger}$ published, not measured here" in out
+    assert r"$^{\dagger}$ published, not measured here" in out
     for word in ("toprule", "midrule", "bottomrule", "end{tabular}"):
         assert f"\\{word}" in out
     assert "note: a mean marked" in err
@@ -151,7 +151,8 @@ def test_spread(tmp_path: Path, store: Path, capsys: pytest.CaptureFixture[str])
 
 @pytest.mark.usefixtures("uri")
 @pytest.mark.parametrize(
-    ("suffix", "begins"), [(".md", "| system"), (".tex", "% Median"), (".csv", "kind,"), (".json", "{"), ("", "┏")]
+    ("suffix", "begins"),
+    [(".md", "| system"), (".tex", "% \\use"), (".csv", "kind,"), (".json", "{"), ("", "┏")],
 )
 def test_a_file_by_its_name(suffix: str, begins: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "new" / f"report{suffix}"

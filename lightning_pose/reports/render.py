@@ -91,18 +91,16 @@ def as_markdown(report: Report, shown: Shown) -> str:
 
 
 def as_latex(report: Report, shown: Shown) -> str:
-    """A `tabular` for the package booktabs; notes are comments, sources of published rows are set below it."""
+    """A `tabular` for the package booktabs, and below it in small print what must be said."""
     headings, lines = _grid(report, shown)
-    out = [f"% {note}" for note in _said(report)]
-    out += ["% \\usepackage{booktabs}", f"\\begin{{tabular}}{{ll{'r' * (len(headings) - 2)}}}", "\\toprule"]
+    out = ["% \\usepackage{booktabs}", f"\\begin{{tabular}}{{ll{'r' * (len(headings) - 2)}}}", "\\toprule"]
     out += [" & ".join(map(_tex, headings)) + r" \\", "\\midrule"]
     for i, (row, line) in enumerate(zip(report.rows, lines, strict=True)):
         if i and report.rows[i - 1].kind != row.kind:
             out.append("\\midrule")
         out.append(" & ".join(_joined(cell, _tex, r"\textbf{{{}}}") for cell in line) + r" \\")
-    out += ["\\bottomrule", "\\end{tabular}"]
-    if report.footnotes:
-        out.append(f"\\par\\smallskip{{\\footnotesize {_tex(f'{MARK} ' + '; '.join(report.footnotes))}.}}")
+    out += ["\\bottomrule", "\\end{tabular}", "\\par\\smallskip", "{\\footnotesize\\raggedright"]
+    out += [f"{_tex(note)}\\par" for note in _said(report)] + ["}"]
     return "\n".join(out)
 
 
