@@ -16,7 +16,8 @@ __all__ = ["main"]
 FORMATS = {"table": ".txt", "markdown": ".md", "latex": ".tex", "csv": ".csv", "json": ".json"}
 
 HELP = """A table of systems (rows) by scenes (columns), median position error in metres / median orientation error in
-degrees on the test frames, and the mean over the scenes, out of the runs that `fit` and `test` have left in MLflow.
+degrees on the test frames, and the mean over the scenes of each dataset, out of the runs that `fit` and `test` have
+left in MLflow.
 
   everything               report
   beside published rows    report --published --baselines
@@ -32,11 +33,11 @@ degrees on the test frames, and the mean over the scenes, out of the runs that `
 
 RULES = """Several runs of a system on a scene are joined by --pick:
 
-  best     the run with the lowest validation error (val/position_median_m, else val/loss, of its best epoch). Test
-           errors never choose. Where no run has one, the newest.
+  best     the run with the lowest validation error (val/position_median_m, else val/loss, of its best epoch, or of its
+           last where it does not tell that one). Test errors never choose. Where no run has one, the newest.
   latest   the newest run
-  spread   mean and standard deviation over runs that differ in nothing but seed_everything; others are refused, or
-           get rows of their own with --by NAME
+  spread   mean and standard deviation over runs that differ in nothing but seed_everything (and in the folder of the
+           same data); others are refused, or get rows of their own with --by NAME
 
 Runs of a scene must agree in what they were tested on: task (absolute poses of images, or relative poses of clips),
 dataset, split, ground_truth, unit, image_size, test_frames, and for clips clip_length, stride and relative_frame.
@@ -44,7 +45,7 @@ Where they do not, nothing is shown until one is chosen, as in --tag task=absolu
 tags (features, split, task, git_commit) and of settings as fit has them (model.units, data.extractor.n_features,
 seed_everything). Only finished runs count, and trials of sweeps only with --trials.
 
-CSV is tidy, a line a system and scene; its notes, as those of LaTeX, go to standard error as well."""
+CSV is tidy, a line a system and scene, and one a mean; its notes, as those of LaTeX, go to standard error."""
 
 
 def main(argv: list[str]) -> int:

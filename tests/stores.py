@@ -36,7 +36,7 @@ class FakeRun:
         val: median position error on validation frames; None where it has none.
         day: of March 2026, when it started.
         tags: beside those of `TAGS`; None takes one away.
-        params: beside those of `PARAMS`.
+        params: beside those of `PARAMS`, and the name, scene and features that `fit` keeps as parameters too.
         metrics: further ones.
         status: MLflow's.
         deleted: by the user.
@@ -65,6 +65,12 @@ class FakeRun:
     def all_tags(self) -> dict[str, str]:
         tags = {**TAGS, "architecture": self.system, "scene": self.scene, **self.tags}
         return {name: value for name, value in tags.items() if value is not None}
+
+    @property
+    def all_params(self) -> dict[str, str]:
+        tags = self.all_tags
+        twice = {name: tags[name] for name in ("architecture", "scene", "features") if name in tags}
+        return {**PARAMS, **twice, **self.params}
 
 
 def make_store(file: Path, empty: Path, runs: Iterable[FakeRun], epochs: int = 0) -> str:
@@ -106,7 +112,7 @@ def _add(connection: sqlite3.Connection, run: FakeRun, run_id: str, epochs: int)
         " artifact_uri, user_id) VALUES (?, ?, ?, ?, ?, ?, 'LOCAL', '', 'ada')",
         [run_id, name, run.status, started, stage, *known],
     )
-    for table, values in (("tags", run.all_tags), ("params", {**PARAMS, **run.params})):
+    for table, values in (("tags", run.all_tags), ("params", run.all_params)):
         rows = [(name, value, run_id) for name, value in values.items()]
         connection.executemany(f"INSERT INTO {table} (key, value, run_uuid) VALUES (?, ?, ?)", rows)
     rows = [_value(name, value) for name, value in run.all_metrics.items()]

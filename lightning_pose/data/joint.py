@@ -25,7 +25,8 @@ def join_scenes(train: Sequence[Scene], test: Sequence[Scene]) -> Scene:
         test: likewise; those of the same folder are the same scene.
 
     Returns:
-        the scene, its `name` both lists (`kitchen to office` where they differ).
+        the scene, its `name` both lists (`kitchen to office` where they differ); formats and ground truths that differ
+        are joined, that of the last scene tested on at the end.
 
     Raises:
         DataError: the scenes' units differ.
@@ -45,15 +46,21 @@ def join_scenes(train: Sequence[Scene], test: Sequence[Scene]) -> Scene:
         named = (replace(frame, sequence=f"{scene.name}/{frame.sequence}") for frame in scene.frames)
         frames += named if len(known) > 1 else scene.frames
     learned, asked = ("+".join(dict.fromkeys(scene.name for scene in part)) for part in (train, test))
+    seen = [scene for scene in test if scene.root.resolve() in trained]
     return replace(
         train[0],
         name=learned if learned == asked else f"{learned} to {asked}",
-        format="+".join(dict.fromkeys(scene.format for scene in known.values())),
+        format=_told([scene.format for scene in train], [scene.format for scene in test]),
         frames=tuple(frames),
         splits={split: np.concatenate([np.zeros(0, np.int64), *parts]) for split, parts in splits.items()},
-        split_source="unseen" if not trained & tested else train[0].split_source,
-        ground_truth="+".join(dict.fromkeys(scene.ground_truth for scene in known.values())),
+        split_source=seen[0].split_source if seen else "unseen",
+        ground_truth=_told([scene.ground_truth for scene in train], [scene.ground_truth for scene in test]),
     )
+
+
+def _told(learned: Sequence[str], asked: Sequence[str]) -> str:
+    """What scenes say, each value once, those of the scenes tested on last: errors are of these."""
+    return "+".join(dict.fromkeys([*(value for value in learned if value not in asked), *asked]))
 
 
 def _given(scene: Scene, trained: bool, tested: bool) -> dict[str, np.ndarray]:

@@ -8,7 +8,16 @@ from collections.abc import Iterable, Mapping, Sequence
 from lightning_pose.errors import ConfigError
 from lightning_pose.reports.store import Run
 
-__all__ = ["FACTS", "column_facts", "describe_facts", "differing_settings", "missing_facts"]
+__all__ = [
+    "FACTS",
+    "FOLDERS",
+    "column_facts",
+    "describe_facts",
+    "differing_settings",
+    "missing_facts",
+    "same_data",
+    "tested",
+]
 
 FACTS = (
     "task",
@@ -34,6 +43,9 @@ REASONS = {
 
 OPERATIONAL = {"data.cache_dir", "data.workers"}
 """Settings that no result depends on."""
+
+FOLDERS = ("data.root", "data.train_scenes", "data.test_scenes")
+"""Settings that say where the data lie, and so name the same data in many ways."""
 
 SEEDS = {"seed"}
 
@@ -98,6 +110,21 @@ def describe_facts(facts: Mapping[str, str]) -> str:
     if facts.get("unit", "m") != "m":
         parts.append("positions in units of the scene, not metres")
     return ", ".join(parts) or "nothing told of split and ground truth"
+
+
+def tested(scene: str, facts: Mapping[str, str], fact: str) -> str | None:
+    """A fact of the scene that a column's errors are of: of `den to chess`, trained in one and tested in the other, a
+    run tells the ground truth `synthetic+original`."""
+    told = facts.get(fact)
+    if told is None or "+" in scene.rpartition(" to ")[2]:
+        return told
+    return told.rpartition("+")[2]
+
+
+def same_data(runs: Sequence[Run]) -> bool:
+    """Whether runs tell of the same scene, split and number of test frames, whatever folder they read them from."""
+    told = {tuple(run.settings.get(fact) for fact in ("scene", "split", "test_frames")) for run in runs}
+    return len(told) == 1 and None not in next(iter(told))
 
 
 def differing_settings(runs: Iterable[Run], ignore: Iterable[str] = ()) -> dict[str, list[str]]:

@@ -6,41 +6,61 @@ import csv
 import io
 import json
 import math
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from lightning_pose.reports.render import HEADINGS
-from lightning_pose.reports.store import Run
-from lightning_pose.reports.tables import SKILLS, Cell, Report, Row
+from lightning_pose.reports.tables import SKILLS, Cell, Mean, Report, Row, over_scenes
 
 __all__ = ["as_csv", "as_json"]
+
+ERRORS = ("position_median_m", "orientation_median_deg", "position_std_m", "orientation_std_deg")
 
 
 def as_csv(report: Report) -> str:
     """One line a system and scene: `pandas.read_csv(FILE).pivot(index="system", columns="scene", values=...)`.
 
-    Costs and skill are those of the cell's own runs, their mean where there are several. `kind` is own, baseline or
-    published; `runs` are MLflow's ids, separated by spaces.
+    Means are lines too, with the column of the mean as their scene. Costs and skill are those of the line's own runs,
+    their mean where there are several. `kind` is own, baseline or published; `n` is how many runs a cell has, or how
+    many scenes a mean is over; `runs` are MLflow's ids, separated by spaces.
     """
-    by = list(next((row.settings for row in report.rows if row.kind == "own"), {}))
-    errors = ["position_median_m", "orientation_median_deg", "position_std_m", "orientation_std_deg"]
     facts = list(dict.fromkeys(fact for told in report.facts.values() for fact in told))
-    heading = ["kind", "system", *by, "features", "scene", *errors, "n", *SKILLS, *HEADINGS, *facts, "source", "runs"]
+    columns = ["features", "scene", *ERRORS, "n", *SKILLS, *HEADINGS, *facts, "source", "runs"]
+    asked = next((row.settings for row in report.rows if row.kind == "own"), {})
+    by = [name for name in asked if name not in ("kind", "system", *columns)]
     out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(heading)
+    writer = csv.DictWriter(out, ["kind", "system", *by, *columns], lineterminator="\n")
+    writer.writeheader()
     for row in report.rows:
-        for scene, cell in row.cells.items():
-            published = row.kind == "published"
-            own = cell.runs if row.kind == "own" else ()
-            writer.writerow(
-                [row.kind, row.system, *(row.settings.get(name, "") for name in by)]
-                + ["" if published else row.features, scene, *map(_text, _errors(cell)), len(cell.runs) or ""]
-                + [_text(_average(own, f"test/{name}")) for name in SKILLS]
-                + [_text(_average(own, f"cost/{name}")) for name in HEADINGS]
-                + ["" if published else report.facts[scene].get(fact, "") for fact in facts]
-                + [row.source, " ".join(run.run_id for run in cell.runs)]
-            )
+        about = {"kind": row.kind, "system": row.system, "source": row.source}
+        about |= {name: row.settings.get(name, "") for name in by}
+        about |= {} if row.kind == "published" else {"features": row.features}
+        writer.writerows({**about, **line} for line in _lines(row, report))
     return out.getvalue().rstrip("\n")
+
+
+def _lines(row: Row, report: Report) -> Iterator[dict[str, Any]]:
+    """The cells of a row, and then its means."""
+    for scene, cell in row.cells.items():
+        told = dict(zip(ERRORS, map(_text, _errors(cell)), strict=True))
+        runs = " ".join(run.run_id for run in cell.runs)
+        yield {"scene": scene, **told, "n": len(cell.runs) or "", "runs": runs, **_beside(row, report, [scene])}
+    for column, mean in row.means.items():
+        told = dict(zip(ERRORS[:2], map(_text, (mean.position_m, mean.orientation_deg)), strict=True))
+        yield {"scene": column, **told, "n": mean.scenes, **_beside(row, report, report.means[column])}
+
+
+def _beside(row: Row, report: Report, scenes: Sequence[str]) -> dict[str, str]:
+    """Costs and skill of a system on some scenes, and the facts that these share; nothing for what is published."""
+    if row.kind == "published":
+        return {}
+    told = [report.facts[scene] for scene in scenes]
+    shared = {fact: value for fact, value in told[0].items() if all(facts.get(fact) == value for facts in told)}
+    if row.kind == "baseline":
+        return shared
+    cells = {scene: row.cells[scene] for scene in scenes if scene in row.cells}
+    metrics = {name: f"test/{name}" for name in SKILLS} | {name: f"cost/{name}" for name in HEADINGS}
+    return shared | {name: _text(value) for name, value in over_scenes(cells, metrics).items()}
 
 
 def as_json(report: Report) -> str:
@@ -56,28 +76,29 @@ def as_json(report: Report) -> str:
 
 
 def _row(row: Row) -> dict[str, Any]:
-    mean = row.mean
     return {
         "kind": row.kind,
         "system": row.system,
         "features": None if row.kind == "published" else row.features,
         "settings": dict(row.settings),
         "cells": {scene: _cell(cell) for scene, cell in row.cells.items()},
-        "mean_of_scenes": mean
-        and {
-            "position_median_m": _finite(mean.position_m),
-            "orientation_median_deg": _finite(mean.orientation_deg),
-            "scenes": mean.scenes,
-        },
+        "means": {column: _mean(mean) for column, mean in row.means.items()},
         "skill": {name: _finite(value) for name, value in row.skill.items()},
         "costs": {name: _finite(value) for name, value in row.costs.items()},
         "source": row.source or None,
     }
 
 
+def _mean(mean: Mean) -> dict[str, Any]:
+    return {
+        "position_median_m": _finite(mean.position_m),
+        "orientation_median_deg": _finite(mean.orientation_deg),
+        "scenes": mean.scenes,
+    }
+
+
 def _cell(cell: Cell) -> dict[str, Any]:
-    names = ("position_median_m", "orientation_median_deg", "position_std_m", "orientation_std_deg")
-    told = dict(zip(names, map(_finite, _errors(cell)), strict=True))
+    told = dict(zip(ERRORS, map(_finite, _errors(cell)), strict=True))
     return {
         **told,
         "candidates": cell.candidates,
@@ -96,11 +117,6 @@ def _cell(cell: Cell) -> dict[str, Any]:
 
 def _errors(cell: Cell) -> tuple[float | None, ...]:
     return cell.position_m, cell.orientation_deg, cell.position_std_m, cell.orientation_std_deg
-
-
-def _average(runs: tuple[Run, ...], metric: str) -> float | None:
-    values = [run.metrics[metric] for run in runs if metric in run.metrics]
-    return sum(values) / len(values) if values else None
 
 
 def _text(value: float | None) -> str:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from lightning_pose.errors import ConfigError
-from lightning_pose.reports.compare import differing_settings
+from lightning_pose.reports.compare import FOLDERS, differing_settings, same_data
 from lightning_pose.reports.store import Run
 
 __all__ = ["PICKS", "Choice", "Pick", "pick_runs"]
@@ -27,10 +27,14 @@ class Choice:
     Attributes:
         notes: where it is told.
         by: how many cells were decided by each metric.
+        judged: how many runs that took.
+        by_last: how many of them tell only their last epoch's.
     """
 
     notes: list[str]
     by: Counter[str] = field(default_factory=Counter)
+    judged: int = 0
+    by_last: int = 0
     unmeasured: list[str] = field(default_factory=list)
     passed_over: list[str] = field(default_factory=list)
     uneven: list[str] = field(default_factory=list)
@@ -52,7 +56,11 @@ class Choice:
         if pick == "latest":
             return "the newest run of each system and scene"
         metrics = " or ".join(self.by) or VALIDATION[0]
-        return f"of each system and scene, the run that is best by {metrics} of its best epoch; never by test errors"
+        last = f" (of its last, for {self.by_last} of {self.judged} runs that do not tell their best)"
+        return (
+            f"of each system and scene, the run that is best by {metrics} of its best epoch"
+            f"{last if self.by_last else ''}; never by test errors"
+        )
 
 
 def pick_runs(runs: Sequence[Run], pick: Pick, cell: str, choice: Choice) -> list[Run]:
@@ -82,6 +90,8 @@ def _best(runs: Sequence[Run], cell: str, choice: Choice) -> Run:
         told = [run for run in runs if math.isfinite(_measured(run, metric))]
         if told:
             choice.by[metric] += 1
+            choice.judged += len(told)
+            choice.by_last += sum(f"best/{metric}" not in run.metrics for run in told)
             if len(told) < len(runs):
                 choice.passed_over.append(f"{cell} ({len(runs) - len(told)} of {len(runs)})")
             if "data.val_fraction" in differing_settings(told):
@@ -105,7 +115,24 @@ def _seeds(runs: Sequence[Run], cell: str, choice: Choice) -> list[Run]:
         )
     if len(trained) < len(runs):
         choice.notes.append(f"{cell}: {len(runs) - len(trained)} runs of `test` are left out of the mean over seeds")
+    _check_alike(trained, cell, choice)
+    by_seed = _newest_of_each_seed(trained)
+    if len(by_seed) < len(trained):
+        choice.notes.append(f"{cell}: {len(trained)} runs have {len(by_seed)} seeds; the newest of each counts")
+    commits = {run.tags.get("git_commit") or run.tags.get("mlflow.source.git.commit") for run in by_seed}
+    if len(commits - {None}) > 1:
+        choice.notes.append(f"{cell}: the runs come from {len(commits - {None})} versions of the program")
+    return by_seed
+
+
+def _check_alike(trained: Sequence[Run], cell: str, choice: Choice) -> None:
+    """Refuse runs that differ in more than the seed, or in where the same data lie."""
     different = differing_settings(trained)
+    if same_data(trained) and (folders := [name for name in FOLDERS if different.pop(name, None)]):
+        choice.notes.append(
+            f"{cell}: the runs name {', '.join(folders)} in several ways; taken for the same data, as scene, split and "
+            "number of test frames agree"
+        )
     if different:
         name, values = next(iter(different.items()))
         others = f" and {', '.join(list(different)[1:6])}" if len(different) > 1 else ""
@@ -113,12 +140,12 @@ def _seeds(runs: Sequence[Run], cell: str, choice: Choice) -> list[Run]:
             f"{cell}: {len(trained)} runs differ in {name} ({', '.join(values[:5])}){others}, not only in the seed, "
             f"and have no common mean; give --by {name} for a row each, or --tag {name}={values[0]}"
         )
-    by_seed: dict[str, Run] = {}
-    for run in trained:
-        by_seed.setdefault(run.params.get("seed", run.run_id), run)
-    if len(by_seed) < len(trained):
-        choice.notes.append(f"{cell}: {len(trained)} runs have {len(by_seed)} seeds; the newest of each counts")
-    commits = {run.tags.get("git_commit") or run.tags.get("mlflow.source.git.commit") for run in by_seed.values()}
-    if len(commits - {None}) > 1:
-        choice.notes.append(f"{cell}: the runs come from {len(commits - {None})} versions of the program")
-    return list(by_seed.values())
+
+
+def _newest_of_each_seed(runs: Sequence[Run]) -> list[Run]:
+    """One run of each seed; every run that was given none, as its numbers were drawn anew."""
+    found: dict[str, Run] = {}
+    for run in runs:
+        seed = run.params.get("seed", "None")  # MLflow keeps None as text
+        found.setdefault(run.run_id if seed == "None" else seed, run)
+    return list(found.values())

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
+from lightning_pose.reports.compare import tested
 from lightning_pose.reports.tables import Cell, Mean, Report, Row, add_means
 from lightning_pose.reports.thesis import FRAMES, MEANS, REMARKS, SCENES, TABLES
 
@@ -106,11 +107,10 @@ def _cell(text: str) -> Cell:
 def _known(report: Report, scene: str) -> str | None:
     """The published name of a scene on show; that of the scene tested on, for a model trained elsewhere."""
     facts = report.facts[scene]
-    truth = GROUND_TRUTHS.get(facts.get("dataset", "7scenes"))
-    if truth is None or facts.get("ground_truth", truth) != truth:
+    truth = GROUND_TRUTHS.get(tested(scene, facts, "dataset") or "7scenes")
+    if truth is None or (tested(scene, facts, "ground_truth") or truth) != truth:
         return None
-    letters = re.sub(r"[^a-z]", "", scene.rpartition(" to ")[2].lower())
-    return SCENES.get(letters)
+    return SCENES.get(re.sub("[ _-]", "", scene.rpartition(" to ")[2].lower()))
 
 
 def _merge(rows: list[Row], published: Published, cells: dict[str, Cell]) -> None:
@@ -130,34 +130,53 @@ def _values(cells: dict[str, Cell]) -> dict[str, tuple[float, float | None]]:
 
 def _means(report: Report, columns: dict[str, str]) -> list[Row]:
     """Means over the seven scenes, which stand beside means over just these."""
+    absolute = {scene for scene in columns if report.facts[scene].get("task", "absolute") == "absolute"}
     seven = set(list(SCENES.values())[:SEVEN])
-    if any(facts.get("task", "absolute") != "absolute" for facts in report.facts.values()):
-        return []
-    if set(columns.values()) != seven or len(report.scenes) != SEVEN:
+    for column, scenes in report.means.items():
+        if len(scenes) == SEVEN and {columns[scene] for scene in scenes if scene in absolute} == seven:
+            return [_row_of_mean(column, *published) for published in MEANS]
+    if absolute:
         report.notes.append("published means over the seven scenes are left out: other scenes, or fewer, are on show")
-        return []
-    rows = []
-    for system, source, text in MEANS:
-        cell = _cell(text)
-        mean = Mean(cell.position_m, cell.orientation_deg, SEVEN)
-        rows.append(Row("published", system, source, {}, mean=mean, source=source))
-    return rows
+    return []
+
+
+def _row_of_mean(column: str, system: str, source: str, text: str) -> Row:
+    cell = _cell(text)
+    mean = Mean(cell.position_m, cell.orientation_deg, SEVEN)
+    return Row("published", system, source, {}, means={column: mean}, source=source)
 
 
 def _comparable(report: Report, columns: dict[str, str]) -> str:
     """Whether the scenes on show are what was published."""
-    cut = []
-    for scene, name in columns.items():
-        facts = report.facts[scene]
-        if facts.get("split", "official") != "official":
-            cut.append(f"{scene} has its own split ({facts['split']})")
-        elif facts.get("test_frames", str(FRAMES[name])) != str(FRAMES[name]):
-            cut.append(f"{scene} is a cut, {facts['test_frames']} test frames of {FRAMES[name]}")
-        elif "test_frames" not in facts:
-            cut.append(f"{scene} may be a cut, no run tells how many of the {FRAMES[name]} test frames it has")
-    if not cut:
+    reasons = [why for scene, name in columns.items() for why in _differences(scene, name, report.facts[scene])]
+    if not reasons:
         return "published rows are of the same official test frames; image sizes and training may differ"
-    return f"published rows are of the whole official test split and do not compare: {'; '.join(cut)}"
+    return f"published rows are of the whole official test split and do not compare: {'; '.join(reasons)}"
+
+
+def _differences(scene: str, name: str, facts: Mapping[str, str]) -> list[str]:
+    """What keeps the errors on a scene from comparing with published ones."""
+    reasons = []
+    told, whole = facts.get("test_frames"), str(FRAMES[name])
+    # A scene that was only tested on gives the frames of its official split, and tells that it is unseen.
+    if facts.get("split", "official") not in ("official", "unseen"):
+        reasons.append(f"{scene} has its own split ({facts['split']})")
+    elif told is None:
+        reasons.append(f"{scene} may be a cut, no run tells how many of the {whole} test frames it has")
+    elif told != whole:
+        reasons.append(f"{scene} is a cut, {told} test frames of {whole}")
+    if facts.get("task") == "relative" and _seen(scene, facts):
+        asked = scene.rpartition(" to ")[2]
+        reasons.append(f"{asked} was seen in training, the scenes of published clips were not")
+    return reasons
+
+
+def _seen(scene: str, facts: Mapping[str, str]) -> bool:
+    """Whether the scene tested on was trained on, by the split or, where no run tells that, by the names."""
+    if "split" in facts:
+        return facts["split"] != "unseen"
+    learned, apart, asked = scene.rpartition(" to ")
+    return not apart or asked in learned.split("+")
 
 
 def _footnotes(tables: Sequence[str], means: bool, scenes: set[str]) -> list[str]:

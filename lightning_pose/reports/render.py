@@ -19,7 +19,6 @@ __all__ = ["Shown", "as_latex", "as_markdown", "print_table"]
 MARK = "†"
 ABSENT = "–"  # noqa: RUF001
 SIZES = ((1e9, "GB"), (1e6, "MB"), (1e3, "kB"))
-MEAN = "mean of scenes"
 
 HEADINGS = {
     "parameters": "parameters",
@@ -92,18 +91,16 @@ def as_markdown(report: Report, shown: Shown) -> str:
 
 
 def as_latex(report: Report, shown: Shown) -> str:
-    """A `tabular` for the package booktabs; notes are comments, sources of published rows are set below it."""
+    """A `tabular` for the package booktabs, and below it in small print what must be said."""
     headings, lines = _grid(report, shown)
-    out = [f"% {note}" for note in _said(report)]
-    out += ["% \\usepackage{booktabs}", f"\\begin{{tabular}}{{ll{'r' * (len(headings) - 2)}}}", "\\toprule"]
+    out = ["% \\usepackage{booktabs}", f"\\begin{{tabular}}{{ll{'r' * (len(headings) - 2)}}}", "\\toprule"]
     out += [" & ".join(map(_tex, headings)) + r" \\", "\\midrule"]
     for i, (row, line) in enumerate(zip(report.rows, lines, strict=True)):
         if i and report.rows[i - 1].kind != row.kind:
             out.append("\\midrule")
         out.append(" & ".join(_joined(cell, _tex, r"\textbf{{{}}}") for cell in line) + r" \\")
-    out += ["\\bottomrule", "\\end{tabular}"]
-    if report.footnotes:
-        out.append(f"\\par\\smallskip{{\\footnotesize {_tex(f'{MARK} ' + '; '.join(report.footnotes))}.}}")
+    out += ["\\bottomrule", "\\end{tabular}", "\\par\\smallskip", "{\\footnotesize\\raggedright"]
+    out += [f"{_tex(note)}\\par" for note in _said(report)] + ["}"]
     return "\n".join(out)
 
 
@@ -116,7 +113,7 @@ def _said(report: Report) -> list[str]:
 
 def _grid(report: Report, shown: Shown) -> tuple[list[str], list[Line]]:
     """Headings, and the cells of each row."""
-    headings = ["system", "features", *report.scenes, MEAN]
+    headings = ["system", "features", *report.scenes, *report.means]
     headings += ["skill m / deg"] if shown.skill else []
     headings += HEADINGS.values() if shown.costs else []
     best = _best(report)
@@ -128,7 +125,8 @@ def _line(row: Row, report: Report, best: set[tuple[str, int, str]], shown: Show
     own = row.kind == "own"
     for scene in report.scenes:
         line.append(_errors(row.cells.get(scene), scene, best if own else set()))
-    line.append(_mean(row.mean, len(report.scenes), best if own else set()))
+    for column, scenes in report.means.items():
+        line.append(_mean(row.means.get(column), column, len(scenes), best if own else set()))
     if shown.skill:
         skill = [row.skill.get(name) for name in ("skill_position", "skill_orientation")]
         line.append([Piece(" / ".join("" if v is None else f"{v:.2f}" for v in skill) if any(skill) else "")])
@@ -164,15 +162,15 @@ def _spread(std: float | None, digits: int) -> str:
     return "" if std is None else f" ± {std:.{digits}f}"
 
 
-def _mean(mean: Mean | None, scenes: int, best: set[tuple[str, int, str]]) -> list[Piece]:
+def _mean(mean: Mean | None, column: str, scenes: int, best: set[tuple[str, int, str]]) -> list[Piece]:
     if mean is None:
         return [Piece(ABSENT)]
     position, orientation = _texts(mean)
     whole = mean.scenes == scenes
     pieces = [
-        Piece(position, whole and (MEAN, 0, position) in best),
+        Piece(position, whole and (column, 0, position) in best),
         Piece(" / "),
-        Piece(orientation, whole and (MEAN, 1, orientation) in best),
+        Piece(orientation, whole and (column, 1, orientation) in best),
     ]
     return pieces if whole else [*pieces, Piece(f" [{mean.scenes} of {scenes}]")]
 
@@ -183,7 +181,9 @@ def _best(report: Report) -> set[tuple[str, int, str]]:
     columns: list[tuple[str, list[Cell | Mean]]] = [
         (scene, [row.cells[scene] for row in own if scene in row.cells]) for scene in report.scenes
     ]
-    columns.append((MEAN, [row.mean for row in own if row.mean and row.mean.scenes == len(report.scenes)]))
+    for column, scenes in report.means.items():
+        means = [row.means[column] for row in own if column in row.means]
+        columns.append((column, [mean for mean in means if mean.scenes == len(scenes)]))
     best = set()
     for name, cells in columns:
         if len(cells) > 1:

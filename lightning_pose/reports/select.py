@@ -6,13 +6,21 @@ import difflib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
+from typing import NamedTuple
 
 from lightning_pose.errors import ConfigError
 from lightning_pose.reports.store import Run
 
-__all__ = ["Filters", "check_setting", "read_date", "select_runs", "setting"]
+__all__ = ["Date", "Filters", "check_setting", "read_date", "select_runs", "setting"]
 
 MOST = 12
+
+
+class Date(NamedTuple):
+    """A moment, in milliseconds since 1970 as MLflow counts them, and the text that the user gave for it."""
+
+    text: str
+    milliseconds: float
 
 
 @dataclass(frozen=True)
@@ -33,8 +41,8 @@ class Filters:
     systems: tuple[str, ...] = ()
     scenes: tuple[str, ...] = ()
     tags: tuple[tuple[str, str], ...] = ()
-    since: datetime | None = None
-    until: datetime | None = None
+    since: Date | None = None
+    until: Date | None = None
     trials: bool = False
 
 
@@ -93,7 +101,7 @@ def check_setting(name: str, runs: Iterable[Run]) -> None:
     raise ConfigError(f"no run tells {name!r}, neither as a tag nor as a setting; {hint}")
 
 
-def read_date(text: str, end: bool = False) -> datetime:
+def read_date(text: str, end: bool = False) -> Date:
     """An ISO date or time, of this machine's clock unless it names a zone.
 
     Args:
@@ -101,14 +109,17 @@ def read_date(text: str, end: bool = False) -> datetime:
         end: of a whole day, its end.
 
     Raises:
-        ConfigError: it is neither.
+        ConfigError: it is neither, or lies beyond what the clock can tell.
     """
     try:
         date = datetime.fromisoformat(text)
     except ValueError:
         raise ConfigError(f"{text!r} is no date; give one as 2026-03-01 or 2026-03-01T18:00") from None
     whole_day = len(text) <= len("2026-03-01") and "T" not in text
-    return (date + timedelta(days=1) if end and whole_day else date).astimezone()
+    try:
+        return Date(text, (date + timedelta(days=1) if end and whole_day else date).astimezone().timestamp() * 1e3)
+    except (ValueError, OverflowError, OSError):  # which of them depends on the system
+        raise ConfigError(f"{text!r} is out of range; give a date such as 2026-03-01") from None
 
 
 def _keep_values(runs: list[Run], option: str, wanted: Sequence[str], value: Callable[[Run], str | None]) -> list[Run]:
@@ -126,16 +137,15 @@ def _keep_values(runs: list[Run], option: str, wanted: Sequence[str], value: Cal
 
 
 def _keep_dates(runs: list[Run], filters: Filters) -> list[Run]:
-    low = filters.since.timestamp() * 1e3 if filters.since else float("-inf")
-    high = filters.until.timestamp() * 1e3 if filters.until else float("inf")
+    low = filters.since.milliseconds if filters.since else float("-inf")
+    high = filters.until.milliseconds if filters.until else float("inf")
     kept = [run for run in runs if low <= run.started < high]
     if not kept:
         first, last = (
             datetime.fromtimestamp(end(run.started for run in runs) / 1e3).isoformat(" ", "minutes")
             for end in (min, max)
         )
-        told = " ".join(
-            f"--{n} {d.isoformat(' ', 'minutes')}" for n in ("since", "until") if (d := getattr(filters, n))
-        )
+        dates = {"--since": filters.since, "--until": filters.until}
+        told = " ".join(f"{option} {date.text}" for option, date in dates.items() if date)
         raise ConfigError(f"{told} matches no run; the {len(runs)} others are from {first} to {last}")
     return kept

@@ -134,17 +134,19 @@ def read_runs(uri: str) -> list[Run]:
                 raise ConfigError(_nothing(query, uri))
     else:
         raise ConfigError(
-            f"the tracking store {uri} is no database and no server; give --tracking_uri sqlite:///FILE, another "
-            "database's URL, or the http address of an MLflow server"
+            f"the tracking store {masked(uri)} is no database and no server; give --tracking_uri sqlite:///FILE, "
+            "another database's URL, or the http address of an MLflow server"
         )
     if not runs:
-        raise ConfigError(f"{uri} has no finished run of fit or test; train with `python -m lightning_pose fit`")
+        raise ConfigError(
+            f"{masked(uri)} has no finished run of fit or test; train with `python -m lightning_pose fit`"
+        )
     return sorted(runs, key=lambda run: (run.started, run.run_id), reverse=True)
 
 
-def masked(uri: str) -> str:
-    """A store's address without its password."""
-    return re.sub(r"(://[^:/@]*):[^@/]*@", r"\1:***@", uri)
+def masked(text: str) -> str:
+    """A store's address, or a text with addresses in it, without passwords."""
+    return re.sub(r"(://[^:/@\s]*):\S*@", r"\1:***@", text)
 
 
 @contextmanager
@@ -164,7 +166,7 @@ def _open(uri: str) -> Iterator[Query]:
             yield lambda sql: connection.execute(text(sql)).fetchall()
     except (SQLAlchemyError, ImportError) as error:
         reason = " ".join(str(getattr(error, "orig", None) or error).split())
-        raise ConfigError(f"{masked(uri)} cannot be read ({reason}); check --tracking_uri") from error
+        raise ConfigError(f"{masked(uri)} cannot be read ({masked(reason)}); check --tracking_uri") from error
 
 
 def _with_driver(uri: str) -> str:
@@ -180,7 +182,7 @@ def _open_sqlite(uri: str) -> Iterator[Query]:
     file = Path(uri.removeprefix("sqlite:///").partition("?")[0])
     if not uri.startswith("sqlite:///") or not file.is_file():
         raise ConfigError(
-            f"{uri} does not exist; train with `python -m lightning_pose fit`, or say where the runs are with "
+            f"{masked(uri)} does not exist; train with `python -m lightning_pose fit`, or say where the runs are with "
             "--tracking_uri sqlite:///FILE or MLFLOW_TRACKING_URI"
         )
     try:
@@ -189,7 +191,9 @@ def _open_sqlite(uri: str) -> Iterator[Query]:
             connection.execute("BEGIN")
             yield connection.execute
     except sqlite3.Error as error:
-        raise ConfigError(f"{uri} cannot be read ({error}); give an MLflow database in --tracking_uri") from error
+        raise ConfigError(
+            f"{masked(uri)} cannot be read ({error}); give an MLflow database in --tracking_uri"
+        ) from error
 
 
 def _check_tables(query: Query, uri: str) -> None:
@@ -248,7 +252,7 @@ def _from_server(uri: str) -> list[Run]:
         return runs_of_client(MlflowClient(uri))
     except MlflowException as error:
         reason = str(error).partition("\n")[0]
-        raise ConfigError(f"{masked(uri)} does not answer ({reason}); check --tracking_uri") from error
+        raise ConfigError(f"{masked(uri)} does not answer ({masked(reason)}); check --tracking_uri") from error
 
 
 def runs_of_client(client: MlflowClient, page: int = 1000) -> list[Run]:

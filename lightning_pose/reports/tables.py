@@ -3,26 +3,36 @@
 from __future__ import annotations
 
 import math
-import re
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
-from lightning_pose.reports.compare import column_facts, describe_facts, differing_settings, missing_facts
+from lightning_pose.reports.compare import column_facts, describe_facts, differing_settings, missing_facts, tested
 from lightning_pose.reports.pick import Choice, Pick, pick_runs
 from lightning_pose.reports.select import check_setting, setting
 from lightning_pose.reports.store import Run
 
-__all__ = ["COSTS", "SEVEN_SCENES", "Cell", "Mean", "Report", "Row", "add_means", "build_report"]
+__all__ = ["COSTS", "MEAN", "SEVEN_SCENES", "Cell", "Mean", "Report", "Row", "add_means", "build_report", "over_scenes"]
 
 SEVEN_SCENES = ("chess", "fire", "heads", "office", "pumpkin", "redkitchen", "stairs")
 
 POSITION, ORIENTATION = "position_median_m", "orientation_median_deg"
 COSTS = ("parameters", "train_seconds", "ms_per_frame", "features_ms_per_frame", "frame_bytes", "checkpoint_bytes")
 SKILLS = ("skill_position", "skill_orientation")
-BY_SCENE = ("data.root", "data.format", "data.room_seed", "data.train_scenes", "data.test_scenes", "data.train_rooms",
-            "data.test_rooms")  # fmt: skip
+BY_SCENE = (
+    "scene", "data.root", "data.format", "data.room_seed", "data.train_scenes", "data.test_scenes", "data.train_rooms",
+    "data.test_rooms",
+)  # fmt: skip
+
+MEAN = "mean"
+APART = ("unit", "task", "relative_frame")
+"""Facts in which scenes must not differ for their errors to have a mean."""
+
+MIXED = ("split", "ground_truth", "image_size", "clip_length", "stride")
+"""Facts in which they may, and the reader is told: each column is sound, the mean mixes them."""
+
+PARTIAL = "a mean marked [k of n] is over k of the n scenes, and does not compare with means over others"
 
 UNTOLD = "not told"
 
@@ -73,7 +83,7 @@ class Row:
         settings: those that were asked for by name.
         costs: means over the scenes, by name.
         skill: likewise, model error over that of the first baseline.
-        mean: over scenes; None where none can be.
+        means: over the scenes of a dataset, by the columns of `Report.means`; none where there can be none.
         source: of a published row.
     """
 
@@ -84,7 +94,7 @@ class Row:
     settings: Mapping[str, str] = field(default_factory=dict)
     costs: Mapping[str, float] = field(default_factory=dict)
     skill: Mapping[str, float] = field(default_factory=dict)
-    mean: Mean | None = None
+    means: dict[str, Mean] = field(default_factory=dict)
     source: str = ""
 
 
@@ -107,6 +117,18 @@ class Report:
     rule: str
     notes: list[str]
     footnotes: list[str] = field(default_factory=list)
+
+    @property
+    def means(self) -> dict[str, list[str]]:
+        """The columns of means, one a dataset, and the scenes that each is over."""
+        told = {scene: tested(scene, self.facts[scene], "dataset") for scene in self.scenes}
+        known = {dataset for dataset in told.values() if dataset}
+        if len(known) < 2:  # what a run does not tell goes with any
+            return {MEAN: list(self.scenes)}
+        columns: dict[str, list[str]] = {}
+        for scene, dataset in told.items():
+            columns.setdefault(f"{MEAN} {dataset or 'unknown'}", []).append(scene)
+        return columns
 
     @property
     def captions(self) -> list[str]:
@@ -145,24 +167,38 @@ def build_report(runs: Sequence[Run], pick: Pick = "best", by: Sequence[str] = (
         rows.append(row)
     choice.tell()
     report = Report(scenes, facts, rows, choice.rule(pick), notes)
-    notes += _mixtures(report)
     add_means(report, rows)
     return report
 
 
 def add_means(report: Report, rows: Sequence[Row]) -> None:
-    """Give rows the mean of their cells, where the scenes have one unit and one task."""
-    facts = report.facts.values()
-    if any(len({told[fact] for told in facts if fact in told}) > 1 for fact in ("unit", "task")):
-        note = "scenes differ in unit or task: no mean over them"
-        report.notes += [] if note in report.notes else [note]
-        return
-    for row in rows:
-        if row.cells:
-            row.mean = _mean(list(row.cells.values()))
-    if any(row.mean and row.mean.scenes < len(report.scenes) for row in rows):
-        note = "a mean marked [k of n] is over k of the n scenes, and does not compare with means over others"
-        report.notes += [] if note in report.notes else [note]
+    """Give rows the mean of their cells in each dataset, where its scenes have one unit, one task and one frame."""
+    for column, scenes in report.means.items():
+        dataset = column.removeprefix(MEAN).strip()
+        whose = f"scenes of {dataset}" if dataset else "scenes"
+        if apart := _differing(report, scenes, APART):
+            _note(report, f"{whose} differ in {', '.join(apart)}: no mean over them")
+            continue
+        for fact in _differing(report, scenes, MIXED):
+            _note(report, f"{whose} differ in {fact}: the mean over them mixes the two")
+        for row in rows:
+            cells = [row.cells[scene] for scene in scenes if scene in row.cells]
+            if cells:
+                row.means[column] = _mean(cells)
+                if len(cells) < len(scenes):
+                    _note(report, PARTIAL)
+
+
+def _differing(report: Report, scenes: Sequence[str], facts: Sequence[str]) -> list[str]:
+    """Which facts the scenes differ in, in words; what a run does not tell goes with any."""
+    told = {fact: {tested(scene, report.facts[scene], fact) for scene in scenes} - {None} for fact in facts}
+    return [fact.replace("_", " ") for fact, values in told.items() if len(values) > 1]
+
+
+def _note(report: Report, note: str) -> None:
+    """Say it once: own rows, baselines and published ones have the same scenes."""
+    if note not in report.notes:
+        report.notes.append(note)
 
 
 def _mean(cells: Sequence[Cell]) -> Mean:
@@ -191,8 +227,8 @@ def _row(key: tuple[str, ...], by: Sequence[str], groups: Mapping[str, list[Run]
         features=features,
         cells=cells,
         settings=settings,
-        costs=_over_scenes(cells, {name: f"cost/{name}" for name in COSTS}),
-        skill=_over_scenes(cells, {name: f"test/{name}" for name in SKILLS}),
+        costs=over_scenes(cells, {name: f"cost/{name}" for name in COSTS}),
+        skill=over_scenes(cells, {name: f"test/{name}" for name in SKILLS}),
     )
 
 
@@ -216,7 +252,7 @@ def _std(values: Sequence[float]) -> float:
     return statistics.stdev(values) if all(map(math.isfinite, values)) else math.nan
 
 
-def _over_scenes(cells: Mapping[str, Cell], metrics: Mapping[str, str]) -> dict[str, float]:
+def over_scenes(cells: Mapping[str, Cell], metrics: Mapping[str, str]) -> dict[str, float]:
     """Mean over the scenes of the mean over a cell's runs, of each metric that all of them have."""
     found = {}
     for name, metric in metrics.items():
@@ -227,15 +263,6 @@ def _over_scenes(cells: Mapping[str, Cell], metrics: Mapping[str, str]) -> dict[
     return found
 
 
-def _mixtures(report: Report) -> list[str]:
-    """Notes on scenes that are measured in different ways: each column is sound, a row's mean mixes them."""
-    notes = []
-    for fact in ("split", "ground_truth", "clip_length"):
-        if len({told[fact] for told in report.facts.values() if fact in told}) > 1:
-            notes.append(f"scenes differ in {fact.replace('_', ' ')}: the mean over them mixes the two")
-    return notes
-
-
 def _scene_order(scene: str) -> tuple[int, str]:
     """The seven scenes in the order of the thesis, then the others by name."""
     return (SEVEN_SCENES.index(scene) if scene in SEVEN_SCENES else len(SEVEN_SCENES), scene)
@@ -243,4 +270,12 @@ def _scene_order(scene: str) -> tuple[int, str]:
 
 def _row_order(key: tuple[str, ...]) -> list[tuple[int, float, str]]:
     """By name, numbers as numbers."""
-    return [(0, float(part), "") if re.fullmatch(r"-?[\d.]+(e-?\d+)?", part) else (1, 0.0, part) for part in key]
+    return [_sortable(part) for part in key]
+
+
+def _sortable(text: str) -> tuple[int, float, str]:
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    return (1, 0.0, text) if math.isnan(number) else (0, number, text)

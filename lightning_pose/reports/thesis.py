@@ -28,7 +28,7 @@ SCENES = {
     "stmaryschurch": "mary",
     "shopfacade": "shop",
 }
-"""Names of the datasets' folders, letters only, to the names below."""
+"""Names of the datasets' folders, in small letters without spaces, hyphens and underscores, to the names below."""
 
 FRAMES = {
     "chess": 2000, "fire": 2000, "heads": 1000, "office": 4000, "pumpkin": 2000, "kitchen": 5000, "stairs": 1000,

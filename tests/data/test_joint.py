@@ -45,8 +45,26 @@ def test_what_is_trained_on_is_never_tested_on() -> None:
     joint = join_scenes([scene("a"), scene("b")], [scene("b"), scene("c", official=False)])
     assert joint.split_source == "official", "one of the tested scenes has been seen"
     assert not set(images(joint, "train") + images(joint, "val")) & set(images(joint, "test"))
+    swapped = join_scenes([scene("c", official=False), scene("b")], [scene("b")])
+    assert swapped.split_source == "official", "that of the scene tested on"
     assert images(joint, "val") == ["a/5", "b/5"]
     assert [name for name in images(joint, "test") if name.startswith("b")] == [f"b/{i}" for i in range(6, 10)]
+
+
+def test_what_is_tested_is_named_last() -> None:
+    """So that a reader of the run knows which format and ground truth its errors are of."""
+    room, chess = (
+        replace(scene("room"), ground_truth="synthetic"),
+        replace(scene("chess"), format="7scenes", ground_truth="original"),
+    )
+    heads = replace(chess, name="heads", root=Path("heads"))
+    for train, formats, truths in (
+        ([room], "tum+7scenes", "synthetic+original"),
+        ([chess, room], "tum+7scenes", "synthetic+original"),
+        ([chess], "7scenes", "original"),
+    ):
+        joint = join_scenes(train, [heads])
+        assert (joint.format, joint.ground_truth) == (formats, truths)
 
 
 def test_units_do_not_mix() -> None:

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import statistics
+from collections.abc import Sequence
+from pathlib import Path
 
+import numpy as np
 import pytest
 
+from lightning_pose.data.joint import join_scenes
+from lightning_pose.data.scene import Frame, Scene
 from lightning_pose.reports.published import add_published, published_systems
 from lightning_pose.reports.tables import Report
 from lightning_pose.reports.thesis import FRAMES, SCENES
@@ -17,6 +22,26 @@ def report_on(*scenes: str, **facts: str) -> Report:
     """A table without rows of the user's own."""
     told = {"task": "absolute", "dataset": "7scenes", "split": "official", "ground_truth": "original", "unit": "m"}
     return Report(list(scenes), dict.fromkeys(scenes, told | facts), [], "", [])
+
+
+def a_scene(name: str, form: str = "7scenes", ground_truth: str = "original", test: int | None = None) -> Scene:
+    """A scene with as many frames again to train on as the official split has to test."""
+    count = FRAMES.get(name, 10) if test is None else test
+    frame = Frame(Path(name), np.zeros(3), np.eye(4)[0], "seq-01", 0)
+    splits = {"train": np.arange(count), "val": np.zeros(0, np.int64), "test": np.arange(count, 2 * count)}
+    source = "blocks" if form == "tum" else "official"
+    return Scene(name, Path(name), form, (frame,) * 2 * count, splits, source, ground_truth=ground_truth)
+
+
+ROOM = a_scene("room-0-300-v1", ground_truth="synthetic")
+OFFICE = a_scene("hololens_office", "tum")
+
+
+def clips_on(train: Sequence[Scene], test: Sequence[Scene]) -> Report:
+    """A table of a model of clips, with the facts that its run has."""
+    joint = join_scenes(train, test)
+    facts = {"dataset": joint.format, "split": joint.split_source, "ground_truth": joint.ground_truth}
+    return report_on(joint.name, task="relative", test_frames=str(len(joint.splits["test"])), **facts)
 
 
 def cell(system: str, table: str, scene: str) -> tuple[float, float | None]:
@@ -84,8 +109,7 @@ def test_rows_of_the_scenes_on_show() -> None:
     assert rows["SurfCNN 300"].kind == "published"
     assert list(rows["SurfCNN 300"].cells) == ["redkitchen"]
     assert rows["SurfCNN 300"].cells["redkitchen"].text == ("0.37", "10.25")
-    mean = rows["VidLoc"].mean
-    assert mean is not None
+    mean = rows["VidLoc"].means["mean"]
     assert (mean.position_m, mean.orientation_deg, mean.scenes) == (0.31, None, 1)
     assert any("table 2.3" in note and "recomputed" in note for note in report.footnotes)
     assert any("structure-based" in note for note in report.footnotes)
@@ -120,17 +144,43 @@ def test_other_data_of_the_same_name_has_no_published_rows(facts: dict[str, str]
     assert "no published row: none of the scenes on show (office)" in report.notes[0]
 
 
-def test_means_stand_beside_the_seven_scenes_alone() -> None:
-    whole, part = report_on(*SEVEN), report_on(*SEVEN[:6])
-    for report in (whole, part):
-        add_published(report)
-    means = {row.system: row.mean for row in whole.rows if not row.cells}
+def test_a_folder_of_another_scene_is_not_taken_for_a_published_one() -> None:
+    others = ("office-2", "chess_2", "heads3", "2chess", "my_office")
+    report = report_on(*others, "Red Kitchen", "red_kitchen", "red-kitchen")
+    add_published(report, [2])
+    assert {scene for row in report.rows for scene in row.cells} == {"Red Kitchen", "red_kitchen", "red-kitchen"}
+
+
+def with_cambridge() -> Report:
+    """The ten scenes of tables 4.1 and 5.2."""
+    inside, outside = report_on(*SEVEN), report_on(*list(SCENES)[7:], dataset="cambridge", ground_truth="sfm")
+    return Report([*inside.scenes, *outside.scenes], inside.facts | outside.facts, [], "", [])
+
+
+@pytest.mark.parametrize(("report", "column"), [(report_on(*SEVEN), "mean"), (with_cambridge(), "mean 7scenes")])
+def test_means_stand_beside_the_seven_scenes(report: Report, column: str) -> None:
+    add_published(report)
+    means = {row.system: row.means for row in report.rows if not row.cells}
     assert len(means) == 8
-    atloc = means["AtLoc"]
-    assert atloc is not None
+    assert list(means["AtLoc"]) == [column]
+    atloc = means["AtLoc"][column]
     assert (atloc.position_m, atloc.orientation_deg, atloc.scenes) == (0.20, 7.56, 7)
-    assert all(row.cells for row in part.rows)
-    assert any("means over the seven scenes are left out" in note for note in part.notes)
+
+
+def test_means_over_seven_scenes_do_not_stand_beside_fewer() -> None:
+    report = report_on(*SEVEN[:6])
+    add_published(report)
+    assert all(row.cells for row in report.rows)
+    assert any("means over the seven scenes are left out" in note for note in report.notes)
+
+
+def test_published_rows_have_a_mean_for_each_dataset() -> None:
+    report = with_cambridge()
+    add_published(report, [5])
+    (dense,) = [row for row in report.rows if row.system == "Dense-PoseNet (ImageNet)"]
+    inside, outside = dense.means["mean 7scenes"], dense.means["mean cambridge"]
+    assert (inside.position_m, inside.scenes) == (pytest.approx(1.38 / 7), 7)
+    assert (outside.position_m, outside.orientation_deg) == (pytest.approx(4.6 / 3), pytest.approx(14 / 3))
 
 
 @pytest.mark.parametrize(("task", "systems"), [("relative", 2), ("absolute", 5)])
@@ -142,10 +192,41 @@ def test_clips_stand_beside_clips(task: str, systems: int) -> None:
     assert any("poses are left out" in note for note in report.notes)
 
 
-def test_a_model_trained_elsewhere_stands_beside_the_scene_it_was_tested_on() -> None:
-    report = report_on("room-0 to heads", task="relative")
+@pytest.mark.parametrize(
+    "train",
+    [[a_scene("heads")], [ROOM], [OFFICE], [a_scene("fire"), OFFICE, ROOM]],
+    ids=lambda scenes: "+".join(scene.name for scene in scenes),
+)
+def test_a_model_trained_elsewhere_stands_beside_the_scene_it_was_tested_on(train: list[Scene]) -> None:
+    """The protocol of table 6.1: the official test frames of a scene that was not trained on."""
+    report = clips_on(train, [a_scene("chess")])
+    (scene,) = report.scenes
+    assert scene.endswith(" to chess")
     add_published(report, [6])
-    assert [row.cells["room-0 to heads"].position_m for row in report.rows] == [0.187, 0.148]
+    assert [row.cells[scene].position_m for row in report.rows] == [0.22, 0.16]
+    assert any(note.startswith("published rows are of the same official test frames") for note in report.notes)
+
+
+def test_a_scene_tested_on_that_was_never_published_has_no_rows() -> None:
+    for test in (ROOM, OFFICE, a_scene("chess", "tum"), a_scene("chess", ground_truth="synthetic")):
+        report = clips_on([a_scene("heads"), a_scene("fire", "tum")], [test])
+        add_published(report, [6])
+        assert report.rows == [], test
+
+
+def test_a_part_of_an_unseen_scene_does_not_compare() -> None:
+    report = clips_on([a_scene("heads")], [a_scene("chess", test=150)])
+    add_published(report, [6])
+    assert any("do not compare: heads to chess is a cut, 150 test frames of 2000" in note for note in report.notes)
+
+
+def test_published_clips_are_of_scenes_that_were_not_seen() -> None:
+    says = "do not compare: chess was seen in training, the scenes of published clips were not"
+    for train in ([a_scene("chess")], [a_scene("heads"), a_scene("chess")], [OFFICE, a_scene("chess")]):
+        report = clips_on(train, [a_scene("chess")])
+        add_published(report, [6])
+        assert len(report.rows) == 2
+        assert any(note.endswith(says) for note in report.notes), report.notes
 
 
 @pytest.mark.parametrize(

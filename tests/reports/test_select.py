@@ -64,7 +64,11 @@ def test_filters(runs: list[Run], filters: dict[str, object], kept: list[int]) -
         ({"tags": (("model.units", "1"),)}, "--tag model.units=1 matches no run; there is 100, 200"),
         ({"tags": (("model.unit", "1"),)}, "no run tells 'model.unit', .* did you mean model.units?"),
         ({"tags": (("units", "1"),)}, "no run tells 'units', .* did you mean model.units?"),
-        ({"since": read_date("2026-04-01")}, "--since 2026-04-01 .* matches no run; the 4 others are from 2026-03-01"),
+        ({"since": read_date("2026-04-01")}, "^--since 2026-04-01 matches no run; the 4 others are from 2026-03-01"),
+        (
+            {"since": read_date("2025-03-01T10"), "until": read_date("2026-02-01", end=True)},
+            "^--since 2025-03-01T10 --until 2026-02-01 matches no run",
+        ),
         ({"systems": ("SurfCNN",)}, "none of the 1 runs has test errors; measure a checkpoint with .* test"),
     ],
 )
@@ -85,3 +89,9 @@ def test_nothing_but_trials(runs: list[Run]) -> None:
 def test_no_date(text: str) -> None:
     with pytest.raises(ConfigError, match=f"'{text}' is no date; give one as 2026-03-01"):
         read_date(text)
+
+
+@pytest.mark.parametrize(("text", "end"), [("9999-12-31", True), ("0001-01-01", False), ("0001-01-01T00:00", True)])
+def test_a_date_beyond_the_calendar(text: str, end: bool) -> None:
+    with pytest.raises(ConfigError, match=f"'{text}' is out of range; give a date such as 2026-03-01"):
+        read_date(text, end)

@@ -108,3 +108,30 @@ def test_an_unreachable_database_keeps_its_password() -> None:
         read_runs(uri)
     assert "secret" not in str(info.value)
     assert masked("sqlite:///a.db") == "sqlite:///a.db"
+
+
+@pytest.mark.parametrize(
+    ("uri", "says"),
+    [
+        ("http://ada:secret@localhost:1", r"http://ada:\*\*\*@localhost:1 does not answer \(.*; check --tracking_uri"),
+        ("file://ada:secret@host/runs", r"store file://ada:\*\*\*@host/runs is no database and no server"),
+        ("nosuch://ada:secret@host/runs", r"nosuch://ada:\*\*\*@host/runs cannot be read"),
+        ("sqlite://ada:secret@host/runs.db", r"sqlite://ada:\*\*\*@host/runs.db does not exist"),
+    ],
+)
+def test_no_message_has_a_password(uri: str, says: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "0")
+    with pytest.raises(ConfigError, match=says) as info:
+        read_runs(uri)
+    assert "secret" not in str(info.value)
+
+
+def test_an_empty_server_keeps_its_password(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("lightning_pose.reports.store.runs_of_client", lambda client: [])
+    with pytest.raises(ConfigError, match=r"http://ada:\*\*\*@localhost:5000 has no finished run"):
+        read_runs("http://ada:secret@localhost:5000")
+
+
+def test_passwords_are_masked_to_their_end() -> None:
+    assert masked("http://ada:s@cr/t@host:5000/x") == "http://ada:***@host:5000/x"
+    assert masked("see http://host:5000/a and mail@host") == "see http://host:5000/a and mail@host"

@@ -1,30 +1,13 @@
-"""Tables: which runs a cell shows, means that are recomputed, and mixtures that are refused."""
+"""Tables: means that are recomputed, and mixtures that are refused."""
 
 from __future__ import annotations
-
-import math
-from pathlib import Path
 
 import pytest
 
 from lightning_pose.errors import ConfigError
 from lightning_pose.reports.beside import add_baselines
-from lightning_pose.reports.pick import Pick
-from lightning_pose.reports.store import read_runs
-from lightning_pose.reports.tables import Report, build_report
-from tests.stores import FakeRun, make_store
-
-
-@pytest.fixture
-def table(tmp_path: Path, store: Path):
-    def make(*runs: FakeRun, pick: Pick = "best", by: tuple[str, ...] = ()) -> Report:
-        return build_report(read_runs(make_store(tmp_path / "mlflow.db", store, runs)), pick, by)
-
-    return make
-
-
-def shown(report: Report) -> dict[str, dict[str, float]]:
-    return {row.system: {scene: cell.position_m for scene, cell in row.cells.items()} for row in report.rows}
+from tests.reports.helpers import shown
+from tests.stores import FakeRun
 
 
 def test_rows_are_systems_and_columns_scenes(table) -> None:
@@ -36,81 +19,10 @@ def test_rows_are_systems_and_columns_scenes(table) -> None:
     )
     assert report.scenes == ["chess", "stairs", "office_b"]
     assert shown(report) == {"NodePose": {"chess": 0.2}, "SurfLSTM": {"chess": 0.1, "stairs": 0.3, "office_b": 0.5}}
-    node, lstm = (row.mean for row in report.rows)
+    node, lstm = (row.means["mean"] for row in report.rows)
     assert (lstm.position_m, lstm.orientation_deg, lstm.scenes) == (pytest.approx(0.3), pytest.approx(8.0), 3)
     assert (node.position_m, node.orientation_deg, node.scenes) == (0.2, 7.0, 1)
     assert any(note.startswith("a mean marked [k of n]") for note in report.notes)
-
-
-def test_best_is_by_validation_and_never_by_test(table) -> None:
-    report = table(
-        FakeRun(test=(0.1, 1.0), val=0.3, day=3),
-        FakeRun(test=(0.9, 9.0), val=0.2, day=1),
-        FakeRun(test=(0.05, 1.0), val=math.nan, day=2),
-    )
-    (cell,) = report.rows[0].cells.values()
-    assert (cell.position_m, cell.candidates, len(cell.runs)) == (0.9, 3, 1)
-    assert "best by val/position_median_m" in report.rule
-    assert any("SurfLSTM on chess (1 of 3): runs without a validation metric" in note for note in report.notes)
-
-
-def test_best_is_by_the_best_epoch_where_a_run_tells_it(table) -> None:
-    report = table(
-        FakeRun(test=(0.1, 1.0), val=0.2, day=1),
-        FakeRun(test=(0.9, 9.0), val=0.5, metrics={"best/val/position_median_m": 0.1}, day=2),
-    )
-    assert shown(report) == {"SurfLSTM": {"chess": 0.9}}
-
-
-def test_best_falls_back_to_the_loss_and_then_to_the_newest(table) -> None:
-    by_loss = table(
-        FakeRun(test=(0.1, 1.0), val=None, metrics={"val/loss": 2.0}, day=3),
-        FakeRun(test=(0.9, 9.0), val=None, metrics={"val/loss": 1.0}, day=1),
-    )
-    assert shown(by_loss) == {"SurfLSTM": {"chess": 0.9}}
-    newest = table(FakeRun(test=(0.1, 1.0), val=None, day=1), FakeRun(test=(0.9, 9.0), val=None, day=3))
-    assert shown(newest) == {"SurfLSTM": {"chess": 0.9}}
-    assert "SurfLSTM on chess: no validation metric, so the newest run is shown" in newest.notes
-
-
-def test_the_latest(table) -> None:
-    report = table(FakeRun(test=(0.1, 1.0), val=0.1, day=1), FakeRun(test=(0.9, 9.0), val=0.3, day=3), pick="latest")
-    assert shown(report) == {"SurfLSTM": {"chess": 0.9}}
-
-
-def test_validation_on_different_frames_is_told(table) -> None:
-    report = table(FakeRun(), FakeRun(params={"data.val_fraction": "0.2"}))
-    assert any("different data.val_fraction" in note for note in report.notes)
-
-
-def test_spread_over_seeds(table) -> None:
-    seeds = [FakeRun(test=(value, 10 * value), params={"seed": str(i)}) for i, value in enumerate((0.1, 0.2, 0.6))]
-    (cell,) = table(*seeds, pick="spread").rows[0].cells.values()
-    assert (cell.position_m, cell.orientation_deg) == (pytest.approx(0.3), pytest.approx(3.0))
-    assert cell.position_std_m == pytest.approx(math.sqrt(0.07))  # (0.04 + 0.01 + 0.09) / 2
-    assert len(cell.runs) == 3
-
-
-def test_spread_takes_the_newest_of_each_seed_and_no_test_runs(table) -> None:
-    report = table(
-        FakeRun(test=(9.0, 1.0), params={"seed": "0"}, day=1),
-        FakeRun(test=(0.1, 1.0), params={"seed": "0", "data.workers": "4"}, day=2),
-        FakeRun(test=(0.3, 1.0), params={"seed": "1"}, day=2),
-        FakeRun(test=(9.0, 1.0), params={"seed": "2"}, tags={"verb": "test"}, day=2),
-        pick="spread",
-    )
-    assert shown(report) == {"SurfLSTM": {"chess": pytest.approx(0.2)}}
-    assert "SurfLSTM on chess: 3 runs have 2 seeds; the newest of each counts" in report.notes
-    assert any("1 runs of `test` are left out" in note for note in report.notes)
-
-
-def test_spread_refuses_runs_that_differ_in_more_than_the_seed(table) -> None:
-    runs = [FakeRun(params={"seed": str(n), "model.units": str(n)}) for n in (1, 2)]
-    with pytest.raises(ConfigError, match=r"2 runs differ in model.units \(1, 2\), .* give --by model.units "):
-        table(*runs, pick="spread")
-    assert list(shown(table(*runs, pick="spread", by=("model.units",)))) == ["SurfLSTM (units=1)", "SurfLSTM (units=2)"]
-    with pytest.raises(ConfigError, match="1 runs of `test`, which do not know the seed"):
-        table(FakeRun(tags={"verb": "test"}), pick="spread")
 
 
 def test_rows_by_settings_in_the_order_of_numbers(table) -> None:
@@ -125,6 +37,12 @@ def test_rows_by_settings_in_the_order_of_numbers(table) -> None:
     assert report.rows[1].settings == {"model.neighbours": "20", "features": "surf"}
     with pytest.raises(ConfigError, match=r"no run tells 'neighbors', .* did you mean model.neighbours\?"):
         table(*runs, by=("neighbors",))
+
+
+def test_settings_that_only_look_like_numbers_are_text(table) -> None:
+    values = ("2.6.6", "1e-3", "nan", "10", "2", ".5", "-")
+    report = table(*(FakeRun(params={"version": value}) for value in values), by=("version",))
+    assert [row.settings["version"] for row in report.rows] == ["1e-3", ".5", "2", "10", "-", "2.6.6", "nan"]
 
 
 @pytest.mark.parametrize(
@@ -166,13 +84,76 @@ def test_what_old_runs_do_not_tell_is_told(table) -> None:
                                "150 test frames"]  # fmt: skip
 
 
-def test_no_mean_over_units_or_tasks(table) -> None:
-    report = table(FakeRun(), FakeRun(scene="fox", tags={"unit": "scene"}))
-    assert report.rows[0].mean is None
-    assert "scenes differ in unit or task: no mean over them" in report.notes
-    mixed = table(FakeRun(), FakeRun(scene="den", tags={"split": "blocks"}))
-    assert mixed.rows[0].mean is not None
-    assert "scenes differ in split: the mean over them mixes the two" in mixed.notes
+CLIPS = {"task": "relative", "clip_length": "10", "stride": "1", "relative_frame": "camera"}
+
+
+@pytest.mark.parametrize(
+    ("fact", "other"), [("unit", "scene"), ("task", "absolute"), ("relative_frame", "world")], ids=str
+)
+def test_no_mean_over_what_does_not_add_up(table, fact: str, other: str) -> None:
+    report = table(FakeRun(tags=CLIPS), FakeRun(scene="den", tags={**CLIPS, fact: other}))
+    assert report.rows[0].means == {}
+    told = f"scenes differ in {fact.replace('_', ' ')}: no mean over them"
+    assert [note for note in report.notes if "scenes differ" in note] == [told]
+
+
+@pytest.mark.parametrize(
+    ("fact", "other"),
+    [
+        ("split", "blocks"),
+        ("ground_truth", "sfm"),
+        ("image_size", "320x240"),
+        ("clip_length", "100"),
+        ("stride", "2"),
+    ],
+)
+def test_a_mean_over_mixed_scenes_says_so(table, fact: str, other: str) -> None:
+    report = table(FakeRun(tags=CLIPS), FakeRun(scene="den", tags={**CLIPS, fact: other}))
+    assert report.rows[0].means["mean"].scenes == 2
+    told = f"scenes differ in {fact.replace('_', ' ')}: the mean over them mixes the two"
+    assert [note for note in report.notes if "scenes differ" in note] == [told]
+
+
+def test_errors_of_scenes_tested_alike_mix_wherever_the_network_was_trained(table) -> None:
+    rooms = {"dataset": "tum+7scenes", "ground_truth": "synthetic+original"}
+    report = table(
+        FakeRun(scene="heads to chess", tags={**CLIPS, "split": "unseen"}),
+        FakeRun(scene="den to chess", tags={**CLIPS, "split": "unseen", **rooms}),
+    )
+    assert list(report.means) == ["mean"]
+    assert not any("scenes differ" in note for note in report.notes)
+
+
+def test_a_mean_for_each_dataset(table) -> None:
+    outdoors = {"dataset": "cambridge", "ground_truth": "sfm", "image_size": "1920x1080"}
+    report = table(
+        FakeRun(test=(0.1, 8.0)),
+        FakeRun(scene="fire", test=(0.3, 6.0)),
+        FakeRun(scene="KingsCollege", test=(2.0, 3.0), tags=outdoors),
+        FakeRun(scene="OldHospital", test=(4.0, 5.0), tags=outdoors),
+        FakeRun("NodePose", "ShopFacade", test=(1.0, 4.0), tags=outdoors),
+    )
+    outside = ["KingsCollege", "OldHospital", "ShopFacade"]
+    assert report.means == {"mean 7scenes": ["chess", "fire"], "mean cambridge": outside}
+    node, lstm = report.rows
+    assert {column: mean.scenes for column, mean in node.means.items()} == {"mean cambridge": 1}
+    errors = {column: (mean.position_m, mean.orientation_deg) for column, mean in lstm.means.items()}
+    assert errors == {"mean 7scenes": (pytest.approx(0.2), 7.0), "mean cambridge": (3.0, 4.0)}
+    assert not any("scenes differ" in note for note in report.notes), "each mean is of scenes measured alike"
+
+
+def test_one_datasets_units_leave_the_mean_of_another(table) -> None:
+    report = table(
+        FakeRun(),
+        FakeRun(scene="fox", tags={"dataset": "nerf", "unit": "scene"}),
+        FakeRun(scene="barn", tags={"dataset": "nerf"}),
+        FakeRun(scene="den", tags={"dataset": None}),
+    )
+    assert report.means == {"mean 7scenes": ["chess"], "mean nerf": ["barn", "fox"], "mean unknown": ["den"]}
+    assert list(report.rows[0].means) == ["mean 7scenes", "mean unknown"]
+    assert "scenes of nerf differ in unit: no mean over them" in report.notes
+    alone = table(FakeRun(), FakeRun(scene="den", tags={"dataset": None}))
+    assert alone.means == {"mean": ["chess", "den"]}, "what is not told is taken to match"
 
 
 def test_a_row_with_other_settings_in_other_scenes_says_so(table) -> None:
@@ -181,6 +162,8 @@ def test_a_row_with_other_settings_in_other_scenes_says_so(table) -> None:
         FakeRun(scene="fire", params={"model.units": "200", "data.root": "b"}),
     )
     assert "SurfLSTM has other settings in other scenes: model.units (100, 200)" in report.notes
+    alike = table(FakeRun(), FakeRun(scene="fire"))
+    assert not any("other settings" in note for note in alike.notes), "another scene is no other setting"
 
 
 def test_costs_and_skill_are_means_over_scenes(table) -> None:
@@ -212,8 +195,7 @@ def test_baselines_by_their_features(table) -> None:
         ("oracle", ""),
     ]
     assert rows[0].cells["fire"].orientation_deg == 5.0
-    assert rows[0].mean is not None
-    assert rows[0].mean.position_m == pytest.approx(0.35)
+    assert rows[0].means["mean"].position_m == pytest.approx(0.35)
 
 
 def test_baselines_that_differ_say_whose_they_are(table) -> None:

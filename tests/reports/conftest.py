@@ -1,0 +1,21 @@
+"""Tables of made-up runs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from lightning_pose.reports.pick import Pick
+from lightning_pose.reports.store import read_runs
+from lightning_pose.reports.tables import Report, build_report
+from tests.stores import FakeRun, make_store
+
+
+@pytest.fixture
+def table(tmp_path: Path, store: Path) -> Callable[..., Report]:
+    def make(*runs: FakeRun, pick: Pick = "best", by: tuple[str, ...] = ()) -> Report:
+        return build_report(read_runs(make_store(tmp_path / "mlflow.db", store, runs)), pick, by)
+
+    return make

@@ -1,0 +1,12 @@
+"""What tests of reports share: a report in few words."""
+
+from __future__ import annotations
+
+from lightning_pose.reports.tables import Report
+
+__all__ = ["shown"]
+
+
+def shown(report: Report) -> dict[str, dict[str, float]]:
+    """Position errors by system and scene."""
+    return {row.system: {scene: cell.position_m for scene, cell in row.cells.items()} for row in report.rows}
