@@ -160,7 +160,7 @@ def _best_so_far(study: Study, plan: Plan) -> str:
 def _conclude(study: Study, plan: Plan, client: MlflowClient, parent: str, folder: Path) -> None:
     """Print the best trials, and keep their config and figures in a folder and in the study's run."""
     from lightning_pose.sweeps.record import describe_parent
-    from lightning_pose.sweeps.results import best_trial, draw_figures, show_study, table, tally, write_best
+    from lightning_pose.sweeps.results import best_trial, draw_figures, sheet, show_study, tally, write_best
     from lightning_pose.sweeps.trial import REASON
 
     best = best_trial(study, plan)
@@ -183,7 +183,7 @@ def _conclude(study: Study, plan: Plan, client: MlflowClient, parent: str, folde
             client.log_metric(parent, f"best/{objective.metric}", value)
     describe_parent(client, parent, study, plan)
     if plan.measure is None or plan.exhibit is None:
-        Console().print(table(study, plan))
+        sheet(study, plan).show()
     if plan.measure is None:  # a study has a figure of its own
         for file in draw_figures(study, plan, folder):
             client.log_artifact(parent, str(file), "figures")
@@ -191,7 +191,7 @@ def _conclude(study: Study, plan: Plan, client: MlflowClient, parent: str, folde
     for file in files:
         client.log_artifact(parent, str(file), "study")
     if rows is not None:
-        Console().print(rows)
+        rows.show()
     print(f"{tally(study)}\nfigures and tables in {folder}")
     if config is not None:
         print(f"the best on validation frames: python -m lightning_pose fit --config {config}")

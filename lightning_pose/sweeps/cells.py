@@ -12,14 +12,13 @@ from typing import Any
 
 from optuna import Study
 from optuna.trial import FrozenTrial, TrialState
-from rich.markup import escape
-from rich.table import Table
 
 from lightning_pose.sweeps.exhibit import SCENE, SEED, Exhibit
 from lightning_pose.sweeps.plan import Plan
+from lightning_pose.sweeps.terminal import Sheet
 from lightning_pose.sweeps.trial import CURVES, METRICS, REASON
 
-__all__ = ["Cell", "as_csv", "as_markdown", "as_table", "gather", "name_scenes", "named", "varying"]
+__all__ = ["Cell", "as_csv", "as_markdown", "as_sheet", "gather", "name_scenes", "named", "varying"]
 
 Curve = Mapping[int, float]
 
@@ -157,15 +156,9 @@ def _short(value: float) -> str:
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
 
 
-def as_table(cells: Sequence[Cell], exhibit: Exhibit, title: str) -> Table:
+def as_sheet(cells: Sequence[Cell], exhibit: Exhibit, title: str) -> Sheet:
     """For the terminal."""
-    heads, rows = _rows(cells, exhibit)
-    table = Table(title=title, title_justify="left")
-    for head in heads:
-        table.add_column(head, justify="right", overflow="fold")
-    for row in rows:
-        table.add_row(*map(escape, row))  # a reason may have brackets
-    return table
+    return Sheet(title, *_rows(cells, exhibit))
 
 
 def as_markdown(cells: Sequence[Cell], exhibit: Exhibit) -> str:

@@ -10,17 +10,16 @@ from typing import Any
 import yaml
 from optuna import Study
 from optuna.trial import FrozenTrial, TrialState
-from rich.markup import escape
-from rich.table import Table
 
 from lightning_pose.errors import ConfigError
-from lightning_pose.sweeps.cells import Cell, as_csv, as_markdown, as_table, gather, varying
+from lightning_pose.sweeps.cells import Cell, as_csv, as_markdown, as_sheet, gather, varying
 from lightning_pose.sweeps.config import ParsedConfig
 from lightning_pose.sweeps.drawing import draw_cells, draw_keypoints
 from lightning_pose.sweeps.exhibit import SCENE, Exhibit
 from lightning_pose.sweeps.features import keypoints_of_a_frame
 from lightning_pose.sweeps.plan import Objective, Plan
 from lightning_pose.sweeps.space import nearest
+from lightning_pose.sweeps.terminal import Sheet
 from lightning_pose.sweeps.trial import REASON
 
 __all__ = [
@@ -29,9 +28,9 @@ __all__ = [
     "best_trials",
     "completed",
     "draw_figures",
+    "sheet",
     "short",
     "show_study",
-    "table",
     "tally",
     "write_best",
 ]
@@ -72,20 +71,18 @@ def write_best(trial: FrozenTrial, study: Study, plan: Plan, folder: Path) -> Pa
     return file
 
 
-def table(study: Study, plan: Plan) -> Table:
+def sheet(study: Study, plan: Plan) -> Sheet:
     """The best trials, and why the last ones that broke did."""
     several = len(plan.objectives) > 1
-    shown = Table(title=f"{study.study_name}: {'Pareto front' if several else 'best trials'}", title_justify="left")
     keys = [parameter.key for parameter in plan.space]
-    for name in ("trial", *(o.metric for o in plan.objectives), *_last_names(keys)):
-        shown.add_column(name, justify="right", overflow="fold")
+    heads = ["trial", *(objective.metric for objective in plan.objectives), *_last_names(keys)]
+    rows = []
     for trial in best_trials(study, plan)[:SHOWN]:
         params = [short(trial.params.get(key, "")) for key in keys]
-        shown.add_row(str(trial.number), *(f"{value:.4g}" for value in trial.values), *map(escape, params))
+        rows.append([str(trial.number), *(f"{value:.4g}" for value in trial.values), *params])
     failed = [t for t in study.get_trials(deepcopy=False, states=(TrialState.FAIL,)) if REASON in t.user_attrs]
-    if failed:
-        shown.caption = f"trial {failed[-1].number} failed: {escape(failed[-1].user_attrs[REASON])}"
-    return shown
+    caption = f"trial {failed[-1].number} failed: {failed[-1].user_attrs[REASON]}" if failed else None
+    return Sheet(f"{study.study_name}: {'Pareto front' if several else 'best trials'}", heads, rows, caption)
 
 
 def _last_names(keys: list[str]) -> list[str]:
@@ -94,7 +91,7 @@ def _last_names(keys: list[str]) -> list[str]:
     return [name if last.count(name) == 1 else key for name, key in zip(last, keys, strict=True)]
 
 
-def show_study(study: Study, plan: Plan, folder: Path) -> tuple[list[Path], Table | None]:
+def show_study(study: Study, plan: Plan, folder: Path) -> tuple[list[Path], Sheet | None]:
     """Draw a study's figure, and write its table as `table.md` and, with all that was measured, as `table.csv`.
 
     Returns:
@@ -124,7 +121,7 @@ def show_study(study: Study, plan: Plan, folder: Path) -> tuple[list[Path], Tabl
         draw_cells(cells, exhibit, title).savefig(figure)
     (folder / "table.csv").write_text(as_csv(cells, plan))
     (folder / "table.md").write_text(as_markdown(cells, exhibit))
-    return [figure, folder / "table.csv", folder / "table.md"], as_table(cells, exhibit, title)
+    return [figure, folder / "table.csv", folder / "table.md"], as_sheet(cells, exhibit, title)
 
 
 def _check_measured(cells: Sequence[Cell], exhibit: Exhibit) -> None:

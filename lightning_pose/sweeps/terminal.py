@@ -1,0 +1,66 @@
+"""Tables for the terminal, on their side where that is too narrow for them."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+__all__ = ["Sheet"]
+
+UNKNOWN_WIDTH = 120  # of a file, or of whatever reads the output
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A table of plain text.
+
+    Attributes:
+        title: above it.
+        heads: of the columns.
+        rows: as many cells each as there are heads.
+        caption: below it.
+    """
+
+    title: str
+    heads: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    caption: str | None = None
+
+    def show(self, width: int | None = None) -> None:
+        """Print it, a column for each row where it would not fit otherwise.
+
+        Args:
+            width: of the terminal in characters, if it is not to be found out.
+        """
+        console = Console(width=width or (None if sys.stdout.isatty() else UNKNOWN_WIDTH))
+        columns = list(zip(self.heads, *self.rows, strict=True))
+        upright = _least_width([[*head.split(), *cells] for head, *cells in columns])
+        lying = _least_width([[word for head in self.heads for word in head.split()], *self.rows])
+        on_side = upright > console.width >= lying
+        console.print(self._table(None, columns) if on_side else self._table(self.heads, self.rows))
+
+    def _table(self, heads: Sequence[str] | None, rows: Sequence[Sequence[str]]) -> Table:
+        caption = None if self.caption is None else escape(self.caption)
+        table = Table(
+            title=escape(self.title),
+            title_justify="left",
+            caption=caption,
+            show_header=heads is not None,
+            show_lines=False,
+        )
+        for i in range(len(rows[0]) if rows else 0):
+            name = "" if heads is None else escape(heads[i])
+            table.add_column(name, justify="left" if heads is None and i == 0 else "right", overflow="fold")
+        for row in rows:
+            table.add_row(*map(escape, row))  # a reason may have brackets
+        return table
+
+
+def _least_width(columns: Sequence[Sequence[str]]) -> int:
+    """Of a table that breaks none of these words and numbers."""
+    return 1 + sum(3 + max(map(len, column), default=0) for column in columns)
