@@ -14,12 +14,13 @@ import optuna
 from mlflow import MlflowClient
 from optuna import Study, pruners, samplers
 from optuna.exceptions import UpdateFinishedTrialError
-from optuna.storages import RDBStorage, RetryHeartbeatStaleTrialCallback, fail_stale_trials
+from optuna.storages import RetryHeartbeatStaleTrialCallback, fail_stale_trials
 from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
 from lightning_pose.errors import ConfigError
 from lightning_pose.sweeps.database import alone, connect
+from lightning_pose.sweeps.outages import PatientStorage
 from lightning_pose.sweeps.plan import Plan
 from lightning_pose.sweeps.record import close_run
 from lightning_pose.sweeps.space import grid, nearest
@@ -67,7 +68,7 @@ def is_grid(plan: Plan) -> bool:
     return _plain(plan.sampler["name"]) == "grid"
 
 
-def open_storage(url: str, tracking: str) -> RDBStorage:
+def open_storage(url: str, tracking: str) -> PatientStorage:
     """Connect to Optuna's database; a trial whose process falls silent is failed and queued again.
 
     Args:
@@ -80,7 +81,7 @@ def open_storage(url: str, tracking: str) -> RDBStorage:
     return connect(url, partial(_fell_silent, tracking))
 
 
-def open_study(plan: Plan, name: str, storage: RDBStorage) -> Study:
+def open_study(plan: Plan, name: str, storage: PatientStorage) -> Study:
     """Create the study, or go on with it.
 
     Raises:
@@ -106,7 +107,7 @@ def open_study(plan: Plan, name: str, storage: RDBStorage) -> Study:
     return study
 
 
-def attach(plan: Plan, name: str, storage: RDBStorage) -> Study:
+def attach(plan: Plan, name: str, storage: PatientStorage) -> Study:
     """The study as one worker sees it: with a sampler that draws what no other worker and no other command draws."""
     study = optuna.load_study(study_name=name, storage=storage)
     with alone(storage, name):
@@ -226,7 +227,7 @@ def _tell(number: int, what: str, queued: int | None) -> None:
     print(f"the process of trial {number} {what}; {end}", file=sys.stderr, flush=True)
 
 
-def recover(study: Study, storage: RDBStorage, client: MlflowClient) -> set[int]:
+def recover(study: Study, storage: PatientStorage, client: MlflowClient) -> set[int]:
     """Fail the trials of this machine whose process is gone, without waiting for their hearts to stop, and those of
     any machine whose heart has stopped; queue them again.
 

@@ -17,10 +17,11 @@ import optuna
 from mlflow import MlflowClient
 from optuna import Study
 from optuna.exceptions import UpdateFinishedTrialError
-from optuna.storages import RDBStorage, fail_stale_trials
+from optuna.storages import fail_stale_trials
 from optuna.trial import FrozenTrial, TrialState
 
 from lightning_pose.sweeps.database import alone
+from lightning_pose.sweeps.outages import PatientStorage
 from lightning_pose.sweeps.plan import Plan
 from lightning_pose.sweeps.study import attach, is_grid, open_storage, queue_again, recover, waiting
 from lightning_pose.sweeps.trial import PROCESS, process_name, run_trial
@@ -53,11 +54,11 @@ class Job:
         """Of the store that has the trials' runs."""
         return MlflowClient(self.plan.tracking[0])
 
-    def connect(self) -> RDBStorage:
+    def connect(self) -> PatientStorage:
         """The study's database, by connections of this process's own."""
         return open_storage(self.storage, self.plan.tracking[0])
 
-    def open(self, storage: RDBStorage) -> Study:
+    def open(self, storage: PatientStorage) -> Study:
         """The study, with a sampler of this worker's own."""
         return attach(self.plan, self.study, storage)
 
@@ -76,7 +77,7 @@ def run_alone(job: Job, total: int, finished: Finished) -> None:
         finished()
 
 
-def _run_one(study: Study, storage: RDBStorage, job: Job, taken: Taken = lambda number: None) -> bool:
+def _run_one(study: Study, storage: PatientStorage, job: Job, taken: Taken = lambda number: None) -> bool:
     """One trial; what goes wrong in it is its own affair. False where the study's grid has none left.
 
     One process at a time takes a trial, so that each is taken once, and writes down that it is its own.
