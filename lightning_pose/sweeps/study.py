@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import socket
 import sys
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -25,7 +24,7 @@ from lightning_pose.sweeps.plan import Plan
 from lightning_pose.sweeps.record import close_run
 from lightning_pose.sweeps.space import grid, nearest
 from lightning_pose.sweeps.trial import PROCESS, REASON, RUN
-from lightning_pose.tracking import alive
+from lightning_pose.tracking import has_died
 
 __all__ = [
     "attach",
@@ -239,8 +238,8 @@ def recover(study: Study, storage: PatientStorage, client: MlflowClient) -> set[
     """
     queued = set()
     for trial in study.get_trials(states=(TrialState.RUNNING,)):
-        host, _, process = trial.user_attrs.get(PROCESS, "").rpartition(":")
-        if process and (host != socket.gethostname() or alive(int(process))):
+        process = trial.user_attrs.get(PROCESS)
+        if process is not None and not has_died(process):
             continue
         try:
             storage.set_trial_user_attr(trial._trial_id, REASON, "its process died")

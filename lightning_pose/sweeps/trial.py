@@ -5,9 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import math
-import os
 import shutil
-import socket
 import traceback
 from collections.abc import Mapping
 from typing import Any
@@ -28,23 +26,13 @@ from lightning_pose.sweeps.config import ParsedConfig
 from lightning_pose.sweeps.features import measure_features
 from lightning_pose.sweeps.plan import Plan
 from lightning_pose.sweeps.space import draw
-from lightning_pose.tracking import HOST_TAG, PROCESS_TAG
+from lightning_pose.tracking import process_name, process_tags
 
-__all__ = ["CURVES", "METRICS", "PROCESS", "REASON", "RUN", "process_name", "process_tags", "run_trial"]
+__all__ = ["CURVES", "METRICS", "PROCESS", "REASON", "RUN", "run_trial"]
 
 PROCESS, REASON, RUN = "process", "reason", "mlflow_run"
 METRICS, CURVES = "metrics", "curves"
 """What Optuna keeps of a trial beside its values: who runs it, why it ended early, its run, and what it measured."""
-
-
-def process_name() -> str:
-    """This process, on whatever machine."""
-    return f"{socket.gethostname()}:{os.getpid()}"
-
-
-def process_tags() -> dict[str, str]:
-    """By which a later run finds out that this process has died."""
-    return {HOST_TAG: socket.gethostname(), PROCESS_TAG: str(os.getpid())}
 
 
 class EpochWatch(Callback):

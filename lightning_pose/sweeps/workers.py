@@ -24,7 +24,8 @@ from lightning_pose.sweeps.database import alone
 from lightning_pose.sweeps.outages import PatientStorage
 from lightning_pose.sweeps.plan import Plan
 from lightning_pose.sweeps.study import attach, is_grid, open_storage, queue_again, recover, waiting
-from lightning_pose.sweeps.trial import PROCESS, process_name, run_trial
+from lightning_pose.sweeps.trial import PROCESS, run_trial
+from lightning_pose.tracking import process_name
 
 __all__ = ["Job", "run_alone", "run_together"]
 
