@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import sys
 from collections.abc import Callable, Mapping
@@ -37,7 +38,8 @@ __all__ = [
     "waiting",
 ]
 
-RETRIES = 3
+DEATHS_FORGIVEN = 3
+DEATHS = "deaths"  # of a trial's processes so far, under whatever number it ran
 CELL = "grid_cell"
 SEEDS = "samplers"  # how many there have been
 
@@ -190,35 +192,35 @@ def waiting(study: Study) -> int:
     return len(study.get_trials(deepcopy=False, states=(TrialState.WAITING,)))
 
 
-def _retry(study: Study, trial: FrozenTrial, limit: int | None = RETRIES) -> int | None:
+def queue_again(study: Study, trial: FrozenTrial, died: bool) -> int | None:
     """Queue a trial again that was no failure of its own; what kills its process every time has an end.
 
+    Args:
+        study: that has it.
+        trial: which has ended.
+        died: whether its process did; a trial may be interrupted as often as the user likes.
+
     Returns:
-        The number that it waits under, None where it happened too often.
+        The number that it waits under, None where it died too often.
     """
-    trial.user_attrs = {k: v for k, v in trial.user_attrs.items() if k not in (PROCESS, REASON, RUN)}
+    deaths = trial.user_attrs.get(DEATHS, 0) + died
+    if deaths > DEATHS_FORGIVEN:
+        return None
+    again = copy.deepcopy(trial)
+    again.user_attrs = {k: v for k, v in trial.user_attrs.items() if k not in (PROCESS, REASON, RUN)}
+    again.user_attrs[DEATHS] = deaths
     known = {t.number for t in study.get_trials(deepcopy=False)}
-    RetryHeartbeatStaleTrialCallback(max_retry=limit)(study, trial)
+    RetryHeartbeatStaleTrialCallback()(study, again)
     for queued in study.get_trials(deepcopy=False):
         if queued.number not in known and queued.system_attrs.get("retry_history", [])[-1:] == [trial.number]:
             return queued.number
     return None
 
 
-def queue_again(study: Study, number: int, limit: int | None = RETRIES) -> int | None:
-    """Queue a trial again that was interrupted or whose process died.
-
-    Returns:
-        The number that it waits under, None where it happened too often.
-    """
-    return _retry(study, next(t for t in study.get_trials() if t.number == number), limit)
-
-
 def _fell_silent(tracking: str, study: Study, trial: FrozenTrial) -> None:
     """Queue a trial again, of whatever machine, that Optuna has failed because its heart stopped."""
-    run = trial.user_attrs.get(RUN)
-    _tell(trial.number, "fell silent", _retry(study, trial))
-    close_run(MlflowClient(tracking), run, "its process fell silent")
+    _tell(trial.number, "fell silent", queue_again(study, trial, died=True))
+    close_run(MlflowClient(tracking), trial.user_attrs.get(RUN), "its process fell silent")
 
 
 def _tell(number: int, what: str, queued: int | None) -> None:
@@ -246,7 +248,7 @@ def recover(study: Study, storage: PatientStorage, client: MlflowClient) -> set[
             storage.set_trial_state_values(trial._trial_id, TrialState.FAIL)
         except UpdateFinishedTrialError:
             continue  # it ended in this moment
-        number = queue_again(study, trial.number)
+        number = queue_again(study, trial, died=True)
         _tell(trial.number, "died", number)
         if number is not None:
             queued.add(trial.number)
