@@ -14,12 +14,16 @@ from typing import Any, NoReturn
 import optuna
 import pytest
 import yaml
+from mlflow import MlflowClient
+from mlflow.exceptions import MlflowException
+from optuna.exceptions import StorageInternalError
 from optuna.trial import FrozenTrial, TrialState
 
-from lightning_pose.sweeps import workers
+from lightning_pose.sweeps import trial, workers
 from lightning_pose.sweeps.outages import PatientStorage
-from lightning_pose.sweeps.plan import read_plan
+from lightning_pose.sweeps.plan import Plan, read_plan
 from lightning_pose.sweeps.study import open_storage, open_study, queue_again, recover
+from lightning_pose.sweeps.trial import EpochWatch, run_trial
 from lightning_pose.tracking import machine, process_name
 from tests.helpers import Workplace
 
@@ -224,3 +228,75 @@ def test_ctrl_c_in_the_middle_of_two_workers_trials(workplace: Workplace) -> Non
     assert sorted(run.data.tags.get("sweep.state", "study") for run in runs) == [
         *["COMPLETE"] * 2, *["INTERRUPTED"] * 2, "study",
     ]  # fmt: skip
+
+
+class Fitted:
+    """What training leaves: the epochs that it was told."""
+
+    curves: dict[str, dict[int, float]] = {}  # noqa: RUF012
+    epochs: list[dict[str, float]] = [{"val/loss": 1.0} | dict.fromkeys(BOTH, 0.5)]  # noqa: RUF012
+
+    def __init__(self, args: list[str], watch: EpochWatch, plan: Plan) -> None:
+        watch.epochs = self.epochs
+        self.measured: dict[str, float] = {}
+
+
+def run_one(job: workers.Job) -> FrozenTrial:
+    storage = job.connect()
+    study = job.open(storage)
+    assert workers._run_one(study, storage, job)
+    return last(study)
+
+
+def test_a_study_whose_run_is_deleted_goes_on(
+    job: workers.Job, workplace: Workplace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(trial, "_TrialCLI", Fitted)
+    workplace.client.delete_run(job.parent)
+    assert run_one(job).state == TrialState.COMPLETE
+
+
+def test_a_number_that_is_none_has_a_reason(
+    job: workers.Job, workplace: Workplace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(trial, "_TrialCLI", Fitted)
+    monkeypatch.setattr(Fitted, "epochs", [{"val/loss": 1.0, BOTH[0]: 0.5, BOTH[1]: float("nan")}])
+    ended = run_one(job)
+    assert ended.state == TrialState.FAIL
+    assert ended.user_attrs["reason"].startswith("val/orientation_median_deg came out as nan; lower the learning rate")
+    run = workplace.client.get_run(ended.user_attrs["mlflow_run"])
+    assert (run.info.status, run.data.tags["sweep.state"]) == ("FAILED", "FAILED")
+
+
+def test_a_trial_without_a_run_has_a_reason(job: workers.Job, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*args: Any, **kwargs: Any) -> NoReturn:
+        raise MlflowException("the server is full")
+
+    monkeypatch.setattr(MlflowClient, "create_run", fail)
+    ended = run_one(job)
+    assert (ended.state, ended.user_attrs["reason"]) == (TrialState.FAIL, "MlflowException: the server is full")
+
+
+@pytest.mark.parametrize("gone", ["mlflow", "optuna"])
+def test_a_store_that_fails_hides_no_ctrl_c(gone: str, job: workers.Job, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*args: Any, **kwargs: Any) -> NoReturn:
+        raise MlflowException("out of reach") if gone == "mlflow" else StorageInternalError
+
+    def press(*args: Any) -> NoReturn:
+        monkeypatch.setattr(*((MlflowClient, "set_tag") if gone == "mlflow" else (optuna.Trial, "set_user_attr")), fail)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(trial, "_TrialCLI", press)
+    study = job.open(job.connect())
+    with pytest.raises(KeyboardInterrupt):
+        run_trial(study.ask(), job.plan, job.parent)
+
+
+def test_a_trial_that_breaks_leaves_no_checkpoint(workplace: Workplace) -> None:
+    breaker = {"class_path": "tests.helpers.FailAt", "init_args": {"epoch": 1}}
+    settings = {"trainer.callbacks": [breaker]}
+    file = write(workplace, measure="test", sampler="grid", space={"model.units": [4]}, settings=settings)
+    assert workplace.command("sweep", file) == 2
+    (ended,) = optuna.load_study(study_name=STUDY, storage=address(workplace)).trials
+    assert ended.user_attrs["reason"] == "RuntimeError: a mistake in the program"
+    assert list((workplace.folder / "mlruns" / "checkpoints").rglob("*")) == []
