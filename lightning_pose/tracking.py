@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import os
 import socket
 import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,8 +21,20 @@ from lightning_pose.errors import CheckpointError
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
+    from mlflow.entities import Run
 
-__all__ = ["MLflowLogger", "alive", "default_tracking_uri", "flatten", "last_run", "log_localizer"]
+__all__ = [
+    "PARENT_TAG",
+    "MLflowLogger",
+    "default_tracking_uri",
+    "flatten",
+    "has_died",
+    "last_run",
+    "log_localizer",
+    "machine",
+    "process_name",
+    "process_tags",
+]
 
 REQUIREMENTS = (
     "torch",
@@ -37,6 +51,7 @@ REQUIREMENTS = (
 
 STORE_VARIABLE = "MLFLOW_TRACKING_URI"
 HOST_TAG, PROCESS_TAG = "process.host", "process.id"
+PARENT_TAG = "mlflow.parentRunId"
 
 
 def default_tracking_uri(root: str | Path = "mlruns") -> str:
@@ -97,8 +112,8 @@ class MLflowLogger(MLFlowLogger):
         if not self._claimed:
             self._claimed = True
             # A run that goes on belongs to this process now; the tags of the dead one would have it closed.
-            client.set_tag(str(self.run_id), HOST_TAG, socket.gethostname())
-            client.set_tag(str(self.run_id), PROCESS_TAG, str(os.getpid()))
+            for name, value in process_tags().items():
+                client.set_tag(str(self.run_id), name, value)
             self._close_stale_runs(client)
         return client
 
@@ -108,11 +123,16 @@ class MLflowLogger(MLFlowLogger):
         return self._tracking_uri
 
     def _close_stale_runs(self, client: MlflowClient) -> None:
-        """Mark runs of this machine whose process is gone: nothing could mark them when they died."""
-        query = f"attributes.status = 'RUNNING' and tags.`{HOST_TAG}` = '{socket.gethostname()}'"
-        for run in client.search_runs([str(self.experiment_id)], query):
-            if run.info.run_id != self.run_id and not alive(int(run.data.tags[PROCESS_TAG])):
-                client.set_terminated(run.info.run_id, "KILLED")
+        """Mark runs of this machine whose process is gone: nothing could mark them when they died.
+
+        A sweep's run has the process of whichever command came last, and lives as long as one of its trials does.
+        """
+        running = client.search_runs([str(self.experiment_id)], "attributes.status = 'RUNNING'")
+        dead = [run for run in running if run.info.run_id != self.run_id and _process_has_died(run)]
+        closed = {run.info.run_id for run in dead}
+        held = {run.data.tags.get(PARENT_TAG) for run in running if run.info.run_id not in closed}
+        for run_id in closed - held:
+            client.set_terminated(run_id, "KILLED")
 
     @rank_zero_only
     def log_hyperparams(self, params: Any) -> None:
@@ -140,15 +160,48 @@ def _environment_kept() -> Iterator[None]:
             os.environ[STORE_VARIABLE] = before
 
 
-def alive(process: int) -> bool:
-    """Whether a process of this machine runs."""
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
+@cache
+def machine() -> str:
+    """This machine: its name for people, and what tells it from others of that name, its own earlier boots included.
+
+    Process numbers mean something within one boot only, and within one container where it counts its own.
+    """
+    facts = []
+    with suppress(OSError):  # Linux alone has them
+        facts.append(Path("/proc/sys/kernel/random/boot_id").read_text().strip())
+    with suppress(OSError):
+        facts.append(str(Path("/proc/self/ns/pid").stat().st_ino))
+    digest = hashlib.sha256(" ".join(facts).encode()).hexdigest()[:8]
+    return f"{socket.gethostname()} {digest}" if facts else socket.gethostname()
+
+
+def process_name() -> str:
+    """This process, on whatever machine."""
+    return f"{machine()}:{os.getpid()}"
+
+
+def process_tags() -> dict[str, str]:
+    """By which a later run finds out that this process has died."""
+    return {HOST_TAG: machine(), PROCESS_TAG: str(os.getpid())}
+
+
+def has_died(process: str) -> bool:
+    """Whether a process, by its `process_name`, was of this machine and is gone; of other machines nothing is known."""
+    host, _, number = process.rpartition(":")
+    if host != machine():
         return False
+    try:
+        os.kill(int(number), 0)
+    except ProcessLookupError:
+        return True
     except PermissionError:
         pass
-    return True
+    return False
+
+
+def _process_has_died(run: Run) -> bool:
+    tags = run.data.tags
+    return HOST_TAG in tags and PROCESS_TAG in tags and has_died(f"{tags[HOST_TAG]}:{tags[PROCESS_TAG]}")
 
 
 def flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -10,6 +10,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,6 +35,7 @@ __all__ = [
     "TerminateAt",
     "Thumbnails",
     "Trained",
+    "WaitAt",
     "Workplace",
     "write_scene",
 ]
@@ -113,6 +115,26 @@ class KillOnce(FailAt):
         with contextlib.suppress(FileExistsError):
             self.marker.touch(exist_ok=False)
             os.kill(os.getpid(), signal.SIGKILL)
+
+
+class WaitAt(FailAt):
+    """Leaves a file for its process in the middle of an epoch, and goes on only when the file `go` is there as well.
+
+    Args:
+        folder: of these files.
+        epoch: in which it happens.
+    """
+
+    def __init__(self, folder: str, epoch: int = 1) -> None:
+        super().__init__(epoch)
+        self.folder = Path(folder)
+
+    def stop(self) -> None:
+        (self.folder / f"waits-{os.getpid()}").touch()
+        deadline = time.monotonic() + 300
+        while not (self.folder / "go").exists():
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
 
 
 def write_scene(root: Path, train: Sequence[int] = (12, 12), test: int = 10, size: tuple[int, int] = (64, 48)) -> Path:

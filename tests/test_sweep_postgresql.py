@@ -1,18 +1,26 @@
-"""Studies in PostgreSQL: several commands at once, one that is killed, and addresses that do not do."""
+"""Studies in PostgreSQL: several commands at once, one that is killed, outages, and addresses that do not do."""
 
 from __future__ import annotations
 
 import json
 import signal
+import time
 from collections.abc import Iterator
+from typing import LiteralString
 
 import optuna
 import pytest
 import yaml
+from optuna.exceptions import StorageInternalError
 from optuna.storages import RDBStorage
 from optuna.trial import FrozenTrial, TrialState
 from sqlalchemy.pool import NullPool
 
+from lightning_pose.models import SurfLSTM
+from lightning_pose.sweeps import database as studies
+from lightning_pose.sweeps import outages
+from lightning_pose.sweeps.database import alone
+from lightning_pose.sweeps.study import open_storage
 from tests.helpers import Workplace
 from tests.postgres import PASSWORD, serve
 
@@ -83,6 +91,90 @@ def test_a_killed_command_s_trial_is_run_by_the_next(
     assert again.params["model.units"] == dead.params["model.units"]
     (run,) = (run for run in workplace.runs() if run.info.run_id == dead.user_attrs["mlflow_run"])
     assert (run.info.status, run.data.tags["sweep.reason"]) == ("KILLED", "its process died")
+
+
+class Restart:
+    """A server that restarts: nobody is connected to the studies, nor can be, until someone pauses before trying again.
+
+    It stands for the module `time` of those who pause.
+
+    Attributes:
+        pauses: how many there have been.
+    """
+
+    monotonic = staticmethod(time.monotonic)
+
+    def __init__(self, server: str) -> None:
+        self.server = server
+        self.pauses = 0
+
+    def begin(self) -> None:
+        terminate = "SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE datname = 'studies'"
+        self._execute("ALTER DATABASE studies ALLOW_CONNECTIONS false", terminate)
+
+    def sleep(self, seconds: float) -> None:
+        self.pauses += 1
+        self._execute("ALTER DATABASE studies ALLOW_CONNECTIONS true")
+
+    def _execute(self, *statements: LiteralString) -> None:
+        import psycopg
+
+        with psycopg.connect(f"{self.server}postgres", autocommit=True) as connection:
+            for statement in statements:
+                connection.execute(statement)
+
+
+@pytest.fixture
+def restart(server: str, monkeypatch: pytest.MonkeyPatch) -> Restart:
+    restart = Restart(server)
+    monkeypatch.setattr(outages, "time", restart)
+    return restart
+
+
+def test_a_trial_outlives_a_restart_of_the_server(
+    workplace: Workplace, sweep: list[str], database: str, restart: Restart, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the middle of an epoch: its heart beats in vain, the report waits for the server, and then the heart beats."""
+    beats: list[str] = []
+    beat = RDBStorage.record_heartbeat
+
+    def count(self: RDBStorage, trial_id: int) -> None:
+        try:
+            beat(self, trial_id)
+        except StorageInternalError:
+            beats.append("vain")
+            raise
+        beats.append("heard")
+
+    def await_beats(*awaited: str) -> None:
+        deadline = time.monotonic() + 60
+        while tuple(beats[-len(awaited) :]) != awaited:
+            assert time.monotonic() < deadline, beats
+            time.sleep(0.05)
+
+    def train(self: SurfLSTM) -> None:
+        await_beats("heard")
+        if self.current_epoch == 0:
+            restart.begin()
+            await_beats("vain", "vain")
+
+    monkeypatch.setattr(studies, "HEARTBEAT_SECONDS", 1)
+    monkeypatch.setattr(RDBStorage, "record_heartbeat", count)
+    monkeypatch.setattr(SurfLSTM, "on_train_epoch_start", train)
+    assert workplace.command(*sweep) == 0
+    assert [(trial.number, trial.state) for trial in trials(database)] == [(0, TrialState.COMPLETE)]
+    assert restart.pauses >= 1
+
+
+def test_who_is_alone_outlives_a_restart(
+    workplace: Workplace, database: str, restart: Restart, capfd: pytest.CaptureFixture[str]
+) -> None:
+    storage = open_storage(database, workplace.uri)
+    with alone(storage, STUDY):
+        restart.begin()
+    with alone(storage, STUDY):
+        assert restart.pauses == 1
+    assert capfd.readouterr().err == "the study's database is out of reach; it is tried again\n"
 
 
 MISTAKES = {

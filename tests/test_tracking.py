@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import os
 import shutil
+import socket
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -13,7 +14,16 @@ from pathlib import Path
 import pytest
 
 from lightning_pose.errors import CheckpointError
-from lightning_pose.tracking import REQUIREMENTS, MLflowLogger, default_tracking_uri, flatten, last_run
+from lightning_pose.tracking import (
+    REQUIREMENTS,
+    MLflowLogger,
+    default_tracking_uri,
+    flatten,
+    has_died,
+    last_run,
+    machine,
+    process_name,
+)
 from tests.helpers import Trained, Workplace
 
 DISTRIBUTIONS = {"cv2": "opencv-contrib-python-headless", "yaml": "PyYAML", "sklearn": "scikit-learn"}
@@ -73,7 +83,12 @@ def test_a_run_belongs_to_its_process(logger: MLflowLogger) -> None:
 
 @pytest.mark.parametrize(
     ("process", "host", "status"),
-    [("dead", None, "KILLED"), ("alive", None, "RUNNING"), ("dead", "another machine", "RUNNING")],
+    [
+        ("dead", None, "KILLED"),
+        ("alive", None, "RUNNING"),
+        ("dead", "another machine", "RUNNING"),
+        ("dead", f"{socket.gethostname()} 01234567", "RUNNING"),
+    ],
 )
 def test_runs_whose_process_is_gone_are_closed(
     process: str, host: str | None, status: str, logger: MLflowLogger, workplace: Workplace
@@ -86,6 +101,39 @@ def test_runs_whose_process_is_gone_are_closed(
     following = MLflowLogger(tracking_uri=workplace.uri)
     assert following.client.get_run(run_id).info.status == status
     assert following.client.get_run(str(following.run_id)).info.status == "RUNNING"
+
+
+def test_a_machine_is_more_than_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another boot, or another machine of the same name, has processes of its own under the same numbers."""
+    dead = f"{machine()}:{dead_process()}"
+    assert has_died(dead)
+    assert not has_died(process_name())
+    assert machine().split()[0] == socket.gethostname()
+    monkeypatch.setattr(Path, "read_text", lambda self: "another boot")
+    machine.cache_clear()
+    try:
+        assert machine().split()[0] == socket.gethostname()
+        assert not has_died(dead)
+    finally:
+        monkeypatch.undo()
+        machine.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("trial", "status"), [("dead", "KILLED"), ("alive", "RUNNING"), ("of another machine", "RUNNING")]
+)
+def test_a_sweep_s_run_is_not_closed_while_its_trials_live(
+    trial: str, status: str, logger: MLflowLogger, workplace: Workplace
+) -> None:
+    """As when another command that worked at the study has ended."""
+    parent = str(logger.run_id)
+    logger.client.set_tag(parent, "process.id", str(dead_process()))
+    number = os.getppid() if trial == "alive" else dead_process()
+    host = "elsewhere" if trial == "of another machine" else machine()
+    tags = {"mlflow.parentRunId": parent, "process.host": host, "process.id": str(number)}
+    logger.client.create_run(str(logger.experiment_id), tags=tags)
+    following = MLflowLogger(tracking_uri=workplace.uri)
+    assert following.client.get_run(parent).info.status == status
 
 
 def test_a_run_that_goes_on_is_claimed(logger: MLflowLogger, workplace: Workplace) -> None:

@@ -7,7 +7,7 @@ import sqlite3
 import warnings
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -15,13 +15,13 @@ from typing import Any
 import optuna
 from optuna import Study
 from optuna.exceptions import ExperimentalWarning, OptunaError
-from optuna.storages import RDBStorage
 from optuna.trial import FrozenTrial
 from sqlalchemy import create_engine, func, select
 from sqlalchemy.engine import URL, Engine, make_url
 from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 
 from lightning_pose.errors import ConfigError
+from lightning_pose.sweeps.outages import PatientStorage
 
 __all__ = ["alone", "connect", "shown"]
 
@@ -30,7 +30,7 @@ PATIENCE_SECONDS = 30
 DRIVERS = {"postgres": "postgresql", "postgresql": "postgresql+psycopg"}
 
 
-def connect(url: str, silent: Callable[[Study, FrozenTrial], None]) -> RDBStorage:
+def connect(url: str, silent: Callable[[Study, FrozenTrial], None]) -> PatientStorage:
     """Open Optuna's database, and make its tables where there are none.
 
     Args:
@@ -84,8 +84,8 @@ def _address(url: str) -> URL:
     return address.set(drivername="postgresql") if address.drivername in DRIVERS else address
 
 
-def _open(address: URL, silent: Callable[[Study, FrozenTrial], None]) -> RDBStorage:
-    return RDBStorage(
+def _open(address: URL, silent: Callable[[Study, FrozenTrial], None]) -> PatientStorage:
+    return PatientStorage(
         address.render_as_string(hide_password=False),
         engine_kwargs=_patience(address),
         heartbeat_interval=HEARTBEAT_SECONDS,
@@ -110,7 +110,7 @@ def shown(url: str) -> str:
 
 
 @contextmanager
-def alone(storage: RDBStorage, study: str) -> Iterator[None]:
+def alone(storage: PatientStorage, study: str) -> Iterator[None]:
     """Wait until no other process is in here for this study, and keep others out.
 
     Optuna has no such lock: of two processes that look at the queue of a SQLite file at once both may take the same
@@ -120,16 +120,22 @@ def alone(storage: RDBStorage, study: str) -> Iterator[None]:
         storage: of `connect`.
         study: name.
     """
-    with _locked(storage.engine, 1 + zlib.crc32(study.encode())):
+    with ExitStack() as held:
+        key = 1 + zlib.crc32(study.encode())
+        storage.insist(lambda: held.enter_context(_locked(storage.engine, key)))
         yield
 
 
 @contextmanager
 def _locked(engine: Engine, key: int) -> Iterator[None]:
     if engine.dialect.name == "postgresql":
-        with engine.begin() as connection:
+        with engine.connect() as connection:
             connection.execute(select(func.pg_advisory_xact_lock(key)))
-            yield
+            try:
+                yield
+            finally:
+                with suppress(SQLAlchemyError):  # a server that is gone has given the lock back
+                    connection.rollback()
         return
     # A database of its own, because a locked one could not be written to by the holder's other connections.
     with closing(sqlite3.connect(f"{engine.url.database}-lock", timeout=1, isolation_level=None)) as lock:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import copy
 import json
-import socket
 import sys
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -14,17 +14,18 @@ import optuna
 from mlflow import MlflowClient
 from optuna import Study, pruners, samplers
 from optuna.exceptions import UpdateFinishedTrialError
-from optuna.storages import RDBStorage, RetryHeartbeatStaleTrialCallback, fail_stale_trials
+from optuna.storages import RetryHeartbeatStaleTrialCallback, fail_stale_trials
 from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
 from lightning_pose.errors import ConfigError
 from lightning_pose.sweeps.database import alone, connect
+from lightning_pose.sweeps.outages import PatientStorage
 from lightning_pose.sweeps.plan import Plan
 from lightning_pose.sweeps.record import close_run
 from lightning_pose.sweeps.space import grid, nearest
 from lightning_pose.sweeps.trial import PROCESS, REASON, RUN
-from lightning_pose.tracking import alive
+from lightning_pose.tracking import has_died
 
 __all__ = [
     "attach",
@@ -37,7 +38,8 @@ __all__ = [
     "waiting",
 ]
 
-RETRIES = 3
+DEATHS_FORGIVEN = 3
+DEATHS = "deaths"  # of a trial's processes so far, under whatever number it ran
 CELL = "grid_cell"
 SEEDS = "samplers"  # how many there have been
 
@@ -67,7 +69,7 @@ def is_grid(plan: Plan) -> bool:
     return _plain(plan.sampler["name"]) == "grid"
 
 
-def open_storage(url: str, tracking: str) -> RDBStorage:
+def open_storage(url: str, tracking: str) -> PatientStorage:
     """Connect to Optuna's database; a trial whose process falls silent is failed and queued again.
 
     Args:
@@ -80,7 +82,7 @@ def open_storage(url: str, tracking: str) -> RDBStorage:
     return connect(url, partial(_fell_silent, tracking))
 
 
-def open_study(plan: Plan, name: str, storage: RDBStorage) -> Study:
+def open_study(plan: Plan, name: str, storage: PatientStorage) -> Study:
     """Create the study, or go on with it.
 
     Raises:
@@ -106,7 +108,7 @@ def open_study(plan: Plan, name: str, storage: RDBStorage) -> Study:
     return study
 
 
-def attach(plan: Plan, name: str, storage: RDBStorage) -> Study:
+def attach(plan: Plan, name: str, storage: PatientStorage) -> Study:
     """The study as one worker sees it: with a sampler that draws what no other worker and no other command draws."""
     study = optuna.load_study(study_name=name, storage=storage)
     with alone(storage, name):
@@ -190,35 +192,35 @@ def waiting(study: Study) -> int:
     return len(study.get_trials(deepcopy=False, states=(TrialState.WAITING,)))
 
 
-def _retry(study: Study, trial: FrozenTrial, limit: int | None = RETRIES) -> int | None:
+def queue_again(study: Study, trial: FrozenTrial, died: bool) -> int | None:
     """Queue a trial again that was no failure of its own; what kills its process every time has an end.
 
+    Args:
+        study: that has it.
+        trial: which has ended.
+        died: whether its process did; a trial may be interrupted as often as the user likes.
+
     Returns:
-        The number that it waits under, None where it happened too often.
+        The number that it waits under, None where it died too often.
     """
-    trial.user_attrs = {k: v for k, v in trial.user_attrs.items() if k not in (PROCESS, REASON, RUN)}
+    deaths = trial.user_attrs.get(DEATHS, 0) + died
+    if deaths > DEATHS_FORGIVEN:
+        return None
+    again = copy.deepcopy(trial)
+    again.user_attrs = {k: v for k, v in trial.user_attrs.items() if k not in (PROCESS, REASON, RUN)}
+    again.user_attrs[DEATHS] = deaths
     known = {t.number for t in study.get_trials(deepcopy=False)}
-    RetryHeartbeatStaleTrialCallback(max_retry=limit)(study, trial)
+    RetryHeartbeatStaleTrialCallback()(study, again)
     for queued in study.get_trials(deepcopy=False):
         if queued.number not in known and queued.system_attrs.get("retry_history", [])[-1:] == [trial.number]:
             return queued.number
     return None
 
 
-def queue_again(study: Study, number: int, limit: int | None = RETRIES) -> int | None:
-    """Queue a trial again that was interrupted or whose process died.
-
-    Returns:
-        The number that it waits under, None where it happened too often.
-    """
-    return _retry(study, next(t for t in study.get_trials() if t.number == number), limit)
-
-
 def _fell_silent(tracking: str, study: Study, trial: FrozenTrial) -> None:
     """Queue a trial again, of whatever machine, that Optuna has failed because its heart stopped."""
-    run = trial.user_attrs.get(RUN)
-    _tell(trial.number, "fell silent", _retry(study, trial))
-    close_run(MlflowClient(tracking), run, "its process fell silent")
+    _tell(trial.number, "fell silent", queue_again(study, trial, died=True))
+    close_run(MlflowClient(tracking), trial.user_attrs.get(RUN), "its process fell silent")
 
 
 def _tell(number: int, what: str, queued: int | None) -> None:
@@ -226,7 +228,7 @@ def _tell(number: int, what: str, queued: int | None) -> None:
     print(f"the process of trial {number} {what}; {end}", file=sys.stderr, flush=True)
 
 
-def recover(study: Study, storage: RDBStorage, client: MlflowClient) -> set[int]:
+def recover(study: Study, storage: PatientStorage, client: MlflowClient) -> set[int]:
     """Fail the trials of this machine whose process is gone, without waiting for their hearts to stop, and those of
     any machine whose heart has stopped; queue them again.
 
@@ -238,15 +240,15 @@ def recover(study: Study, storage: RDBStorage, client: MlflowClient) -> set[int]
     """
     queued = set()
     for trial in study.get_trials(states=(TrialState.RUNNING,)):
-        host, _, process = trial.user_attrs.get(PROCESS, "").rpartition(":")
-        if process and (host != socket.gethostname() or alive(int(process))):
+        process = trial.user_attrs.get(PROCESS)
+        if process is not None and not has_died(process):
             continue
         try:
             storage.set_trial_user_attr(trial._trial_id, REASON, "its process died")
             storage.set_trial_state_values(trial._trial_id, TrialState.FAIL)
         except UpdateFinishedTrialError:
             continue  # it ended in this moment
-        number = queue_again(study, trial.number)
+        number = queue_again(study, trial, died=True)
         _tell(trial.number, "died", number)
         if number is not None:
             queued.add(trial.number)

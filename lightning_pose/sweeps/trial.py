@@ -5,9 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import math
-import os
 import shutil
-import socket
 import traceback
 from collections.abc import Mapping
 from typing import Any
@@ -16,7 +14,9 @@ import optuna
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from mlflow import MlflowClient
+from mlflow.exceptions import MlflowException
 from optuna import Trial
+from optuna.exceptions import OptunaError
 
 from lightning_pose.callbacks import BestCheckpoint, checkpoint_folder, run_logger
 from lightning_pose.cli import PoseCLI
@@ -28,23 +28,13 @@ from lightning_pose.sweeps.config import ParsedConfig
 from lightning_pose.sweeps.features import measure_features
 from lightning_pose.sweeps.plan import Plan
 from lightning_pose.sweeps.space import draw
-from lightning_pose.tracking import HOST_TAG, PROCESS_TAG
+from lightning_pose.tracking import PARENT_TAG, process_tags
 
-__all__ = ["CURVES", "METRICS", "PROCESS", "REASON", "RUN", "process_name", "process_tags", "run_trial"]
+__all__ = ["CURVES", "METRICS", "PROCESS", "REASON", "RUN", "run_trial"]
 
 PROCESS, REASON, RUN = "process", "reason", "mlflow_run"
 METRICS, CURVES = "metrics", "curves"
 """What Optuna keeps of a trial beside its values: who runs it, why it ended early, its run, and what it measured."""
-
-
-def process_name() -> str:
-    """This process, on whatever machine."""
-    return f"{socket.gethostname()}:{os.getpid()}"
-
-
-def process_tags() -> dict[str, str]:
-    """By which a later run finds out that this process has died."""
-    return {HOST_TAG: socket.gethostname(), PROCESS_TAG: str(os.getpid())}
 
 
 class EpochWatch(Callback):
@@ -114,7 +104,11 @@ class _TrialCLI(PoseCLI):
         self.plan = plan
         self.measured: dict[str, float] = {}
         self.curves: Mapping[str, Mapping[int, float]] = {}
-        super().__init__(["fit", *args])
+        try:
+            super().__init__(["fit", *args])
+        finally:
+            if plan.measure == "test" and hasattr(self, "trainer"):  # which keeps the best epoch until it is tested
+                shutil.rmtree(checkpoint_folder(self.trainer), ignore_errors=True)
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
         trainer = super().instantiate_trainer(**kwargs)
@@ -140,11 +134,8 @@ class _TrialCLI(PoseCLI):
         """Measure the best epoch on the test frames; for the study's figure alone."""
         report = next(c for c in self.trainer.callbacks if isinstance(c, TestReport))  # type: ignore[attr-defined]
         report.log_model = False
-        try:
-            with contextlib.redirect_stdout(io.StringIO()):  # one table a trial would bury the study's
-                super().after_fit()
-        finally:
-            shutil.rmtree(checkpoint_folder(self.trainer), ignore_errors=True)
+        with contextlib.redirect_stdout(io.StringIO()):  # one table a trial would bury the study's
+            super().after_fit()
         found = report.evaluation
         assert found is not None, "a test ends in an evaluation"
         own = next(iter(report.results.values()))
@@ -180,24 +171,16 @@ def run_trial(trial: Trial, plan: Plan, parent: str) -> float | list[float]:
         KeyboardInterrupt: the user did.
         Exception: whatever broke it; Optuna and MLflow know why.
     """
-    trial.set_user_attr(PROCESS, process_name())
-    uri, experiment = plan.tracking
-    client = MlflowClient(uri)
-    tags = {"mlflow.parentRunId": parent, "sweep.study": trial.study.study_name, "sweep.trial": str(trial.number)}
-    name = f"{trial.study.study_name} trial {trial.number}"  # until its settings are known
-    known = client.get_experiment_by_name(experiment)
-    assert known is not None, "the study's run is in it"
-    run = client.create_run(known.experiment_id, run_name=name, tags=tags | process_tags()).info.run_id
-    trial.set_user_attr(RUN, run)
-    client.update_run(parent, status="RUNNING")  # a command that ended between two trials of this one has closed it
+    client = MlflowClient(plan.tracking[0])
+    run = None
     try:
+        run = _create_run(trial, plan, parent, client)
         values = draw(trial, plan.space)
         for key, value in values.items():
             client.set_tag(run, f"sweep.{key}", str(value))
-        logger = [f"--trainer.logger.run_id={run}"]
         if plan.measure == "features":
             return _features(trial, plan, values, client, run)
-        return _fit(trial, plan, [*plan.arguments(values), *logger], client, run)
+        return _fit(trial, plan, [*plan.arguments(values), f"--trainer.logger.run_id={run}"], client, run)
     except optuna.TrialPruned as pruned:
         _end(trial, client, run, "PRUNED", "KILLED", str(pruned))
         raise
@@ -206,9 +189,22 @@ def run_trial(trial: Trial, plan: Plan, parent: str) -> float | list[float]:
         raise KeyboardInterrupt from stop
     except Exception as error:
         reason = str(error) if isinstance(error, PoseError) else f"{type(error).__name__}: {error}"
-        _end(trial, client, run, "FAILED", "FAILED", reason)
-        client.log_text(run, traceback.format_exc(), "error.txt")
+        _end(trial, client, run, "FAILED", "FAILED", reason, traceback.format_exc())
         raise
+
+
+def _create_run(trial: Trial, plan: Plan, parent: str, client: MlflowClient) -> str:
+    known = client.get_experiment_by_name(plan.tracking[1])
+    assert known is not None, "the study's run is in it"
+    study = trial.study.study_name
+    tags = {PARENT_TAG: parent, "sweep.study": study, "sweep.trial": str(trial.number), **process_tags()}
+    name = f"{study} trial {trial.number}"  # until its settings are known
+    run = client.create_run(known.experiment_id, run_name=name, tags=tags).info.run_id
+    trial.set_user_attr(RUN, run)
+    with contextlib.suppress(MlflowException):  # the user may have deleted it, which is no reason to train nothing
+        # A command that ended between two trials of this one has closed it.
+        client.update_run(parent, status="RUNNING")
+    return run
 
 
 def _fit(trial: Trial, plan: Plan, args: list[str], client: MlflowClient, run: str) -> float | list[float]:
@@ -241,21 +237,41 @@ def _keep(
     client: MlflowClient,
     run: str,
 ) -> float | list[float]:
-    """Keep what a trial measured where the study's table and figure find it, and hand out the objectives' values."""
+    """Keep what a trial measured where the study's table and figure find it, and hand out the objectives' values.
+
+    Raises:
+        ConfigError: one of the values is no finite number.
+    """
+    values = [found[objective.metric] for objective in plan.objectives]
+    for objective, value in zip(plan.objectives, values, strict=True):
+        if not math.isfinite(value):  # Optuna would fail the trial too, without a word
+            raise ConfigError(
+                f"{objective.metric} came out as {value}; lower the learning rate, or leave it out of the objectives"
+            )
     trial.set_user_attr(METRICS, {name: value for name, value in found.items() if math.isfinite(value)})
     if curves:
         trial.set_user_attr(CURVES, {name: list(map(list, curve.items())) for name, curve in curves.items()})
-    values = [found[objective.metric] for objective in plan.objectives]
     for objective, value in zip(plan.objectives, values, strict=True):
         client.log_metric(run, f"objective/{objective.metric}", value)
     client.set_tag(run, "sweep.state", "COMPLETE")
     return values if len(values) > 1 else values[0]
 
 
-def _end(trial: Trial, client: MlflowClient, run: str, state: str, status: str, reason: str) -> None:
-    """Write down why a trial has no value, where Optuna and where MLflow look."""
+def _end(
+    trial: Trial, client: MlflowClient, run: str | None, state: str, status: str, reason: str, error: str | None = None
+) -> None:
+    """Write down why a trial has no value, where Optuna and where MLflow look.
+
+    Nothing that goes wrong in here may hide what ended the trial, least of all a Ctrl-C.
+    """
     shown = " ".join(reason.split())[:500]
-    trial.set_user_attr(REASON, shown)
-    client.set_tag(run, "sweep.state", state)
-    client.set_tag(run, "sweep.reason", shown)
-    client.set_terminated(run, status)
+    with contextlib.suppress(OptunaError):  # a trial that was taken for dead has its reason; the database may be gone
+        trial.set_user_attr(REASON, shown)
+    if run is None:
+        return
+    with contextlib.suppress(MlflowException, OSError):
+        client.set_tag(run, "sweep.state", state)
+        client.set_tag(run, "sweep.reason", shown)
+        client.set_terminated(run, status)
+        if error is not None:
+            client.log_text(run, error, "error.txt")

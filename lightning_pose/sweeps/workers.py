@@ -6,24 +6,28 @@ import contextlib
 import multiprocessing
 import os
 import signal
+import sys
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing.connection import Connection, wait
+from types import FrameType
 from typing import Any
 
 import optuna
 from mlflow import MlflowClient
 from optuna import Study
 from optuna.exceptions import UpdateFinishedTrialError
-from optuna.storages import RDBStorage, fail_stale_trials
+from optuna.storages import fail_stale_trials
 from optuna.trial import FrozenTrial, TrialState
 
 from lightning_pose.sweeps.database import alone
+from lightning_pose.sweeps.outages import PatientStorage
 from lightning_pose.sweeps.plan import Plan
 from lightning_pose.sweeps.study import attach, is_grid, open_storage, queue_again, recover, waiting
-from lightning_pose.sweeps.trial import PROCESS, process_name, run_trial
+from lightning_pose.sweeps.trial import PROCESS, run_trial
+from lightning_pose.tracking import process_name
 
 __all__ = ["Job", "run_alone", "run_together"]
 
@@ -53,11 +57,11 @@ class Job:
         """Of the store that has the trials' runs."""
         return MlflowClient(self.plan.tracking[0])
 
-    def connect(self) -> RDBStorage:
+    def connect(self) -> PatientStorage:
         """The study's database, by connections of this process's own."""
         return open_storage(self.storage, self.plan.tracking[0])
 
-    def open(self, storage: RDBStorage) -> Study:
+    def open(self, storage: PatientStorage) -> Study:
         """The study, with a sampler of this worker's own."""
         return attach(self.plan, self.study, storage)
 
@@ -70,24 +74,52 @@ def run_alone(job: Job, total: int, finished: Finished) -> None:
     """
     storage = job.connect()
     study = job.open(storage)
-    for _ in range(total):
-        if not _run_one(study, storage, job):
-            return
-        finished()
+    before = signal.getsignal(signal.SIGINT)
+    _hear_once()
+    try:
+        for _ in range(total):
+            if not _run_one(study, storage, job):
+                return
+            finished()
+    finally:
+        if before is signal.default_int_handler:
+            signal.signal(signal.SIGINT, before)
 
 
-def _run_one(study: Study, storage: RDBStorage, job: Job, taken: Taken = lambda number: None) -> bool:
+def _hear_once() -> None:
+    """Ctrl-C counts once: a second one must not end the process while it queues the trial of the first again."""
+    heard = False
+
+    def hear(number: int, frame: FrameType | None) -> None:
+        nonlocal heard
+        if not heard:
+            heard = True
+            raise KeyboardInterrupt
+
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # else it is ignored, or someone else's
+        signal.signal(signal.SIGINT, hear)
+
+
+def _run_one(study: Study, storage: PatientStorage, job: Job, taken: Taken = lambda number: None) -> bool:
     """One trial; what goes wrong in it is its own affair. False where the study's grid has none left.
 
     One process at a time takes a trial, so that each is taken once, and writes down that it is its own.
     """
+    own: int | None = None
+    interrupted = False
     with ExitStack() as held:
 
         def objective(trial: optuna.Trial) -> float | list[float]:
-            trial.set_user_attr(PROCESS, process_name())
-            held.close()
-            taken(trial.number)
-            return run_trial(trial, job.plan, job.parent)
+            nonlocal own, interrupted
+            own = trial.number
+            try:
+                trial.set_user_attr(PROCESS, process_name())
+                held.close()
+                taken(trial.number)
+                return run_trial(trial, job.plan, job.parent)
+            except KeyboardInterrupt:
+                interrupted = True
+                raise
 
         held.enter_context(alone(storage, job.study))
         if is_grid(job.plan):
@@ -97,25 +129,26 @@ def _run_one(study: Study, storage: RDBStorage, job: Job, taken: Taken = lambda 
         try:
             study.optimize(objective, n_trials=1, catch=(Exception,), gc_after_trial=True)
         except KeyboardInterrupt:
-            own = _own_failed(study)
-            if own is not None:
-                queue_again(study, own.number, limit=None)
+            if interrupted and _trial(study, own).state == TrialState.FAIL:  # not one that was over already
+                queue_again(study, _trial(study, own), died=False)
             raise
-        except (AssertionError, ValueError, UpdateFinishedTrialError):
-            # Optuna's answer to a result that comes too late, as after this machine slept.
-            if _own_failed(study) is None:
+        except (AssertionError, ValueError, UpdateFinishedTrialError) as error:
+            # Optuna's answers to a result that comes too late, as after this machine slept; or a sampler's mistake.
+            late = isinstance(error, UpdateFinishedTrialError)
+            if own is None or not (late or _trial(study, own).state == TrialState.FAIL):
                 raise
+            if interrupted:
+                raise KeyboardInterrupt from error
     return True
 
 
-def _own_failed(study: Study) -> FrozenTrial | None:
-    """The last trial of this process, if it has just failed."""
-    own = [t for t in study.get_trials(deepcopy=False) if t.user_attrs.get(PROCESS) == process_name()]
-    return own[-1] if own and own[-1].state == TrialState.FAIL else None
+def _trial(study: Study, number: int | None) -> FrozenTrial:
+    return next(trial for trial in study.get_trials(deepcopy=False) if trial.number == number)
 
 
 def _work(job: Job, orders: Connection) -> None:
     """A worker process: one trial for each order, until there are none."""
+    _hear_once()
     try:
         storage = job.connect()
         study = job.open(storage)
@@ -123,7 +156,6 @@ def _work(job: Job, orders: Connection) -> None:
             ran = _run_one(study, storage, job, partial(_send, orders))
             orders.send("done" if ran else "none")
     except KeyboardInterrupt:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second one would only spoil the exit
         _send(orders, "again")
     except (EOFError, BrokenPipeError, ConnectionResetError):
         pass  # the one who gives orders is gone
@@ -149,47 +181,63 @@ def run_together(job: Job, total: int, finished: Finished, workers: int) -> None
 
     Raises:
         KeyboardInterrupt: Ctrl-C; trials under way are queued again.
+        RuntimeError: a worker broke; the others have finished their trials.
     """
-    context = _context(workers)
-    storage = job.connect()
-    study = job.open(storage)
-    left = total
     crew: list[_Worker] = []
     try:
-        while left > 0 or any(worker.busy for worker in crew):
-            while len(crew) < min(workers, left + sum(worker.busy for worker in crew)):
-                crew.append(_start(context, job))
-            for worker in crew:
-                if not worker.busy and left > 0 and _order(worker):
-                    left -= 1
-            for worker in _heard(crew):
-                news = _report(worker)
-                if isinstance(news, int):
-                    worker.trial = news
-                    continue
-                again = news == "again"
-                if news == "dead":
-                    crew.remove(worker)
-                    _check_killed(worker)
-                    with alone(storage, job.study):
-                        queued = recover(study, storage, job.client)
-                    again = worker.trial is None or worker.trial in queued
-                if news == "none":
-                    left = 0  # other commands have taken the rest
-                elif worker.busy and again:
-                    left += 1
-                elif worker.busy:
-                    finished()
-                worker.busy, worker.trial = False, None
+        try:
+            _give_orders(job, total, finished, workers, crew)
+        except Exception:
+            print("the sweep breaks off; trials under way are finished first", file=sys.stderr, flush=True)
+            _dismiss(crew, None)
+            raise
     except KeyboardInterrupt:
         _stop(crew)
         raise
     finally:
+        _dismiss(crew, PATIENCE_SECONDS)
+
+
+def _give_orders(job: Job, total: int, finished: Finished, workers: int, crew: list[_Worker]) -> None:
+    context = _context(workers)
+    storage = job.connect()
+    study = job.open(storage)
+    left = total
+    while left > 0 or any(worker.busy for worker in crew):
+        while len(crew) < min(workers, left + sum(worker.busy for worker in crew)):
+            crew.append(_start(context, job))
         for worker in crew:
-            worker.orders.close()
-            worker.process.join(PATIENCE_SECONDS)
-            if worker.process.is_alive():
-                worker.process.kill()
+            if not worker.busy and left > 0 and _order(worker):
+                left -= 1
+        for worker in _heard(crew):
+            news = _report(worker)
+            if isinstance(news, int):
+                worker.trial = news
+                continue
+            again = news == "again"
+            if news == "dead":
+                crew.remove(worker)
+                _check_killed(worker)
+                with alone(storage, job.study):
+                    queued = recover(study, storage, job.client)
+                again = worker.trial is None or worker.trial in queued
+            if news == "none":
+                left = 0  # other commands have taken the rest
+            elif worker.busy and again:
+                left += 1
+            elif worker.busy:
+                finished()
+            worker.busy, worker.trial = False, None
+
+
+def _dismiss(crew: list[_Worker], patience: float | None) -> None:
+    """Let workers end with the trial that they have; None waits for it however long it takes."""
+    for worker in crew:
+        worker.orders.close()
+    for worker in crew:
+        worker.process.join(patience)
+        if worker.process.is_alive():
+            worker.process.kill()
 
 
 def _context(workers: int) -> Any:
