@@ -81,11 +81,9 @@ def main(argv: list[str]) -> int:
     own, overrides = _split(argv)
     args = _parser().parse_args(own)
     # Only now, so that `--help` is there at once.
-    from optuna.trial import TrialState
-
     from lightning_pose.sweeps.database import alone, shown
     from lightning_pose.sweeps.plan import read_plan
-    from lightning_pose.sweeps.record import open_parent
+    from lightning_pose.sweeps.record import close_parent, open_parent
     from lightning_pose.sweeps.study import enqueue_grid, is_grid, open_storage, open_study, recover, waiting
     from lightning_pose.sweeps.workers import Job
 
@@ -104,6 +102,7 @@ def main(argv: list[str]) -> int:
         if is_grid(plan):
             total = waiting(study) if total is None else min(total, waiting(study))
         _run(study, plan, Job(plan, name, args.storage, parent), N_TRIALS if total is None else total, args.workers)
+        client, parent = open_parent(study, plan)  # another one, if someone has deleted it meanwhile
         _conclude(study, plan, client, parent, args.out or Path("mlruns") / "sweeps" / name)
         status = "FINISHED"
     except KeyboardInterrupt as stop:
@@ -112,8 +111,7 @@ def main(argv: list[str]) -> int:
         status = "FAILED"
         raise
     finally:
-        if not study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):  # else another command ends it
-            client.set_terminated(parent, status)
+        close_parent(client, parent, study, status)
     print(f"run {parent} in {plan.tracking[0]}\nstudy {name} in {shown(args.storage)}")
     return 0
 

@@ -6,6 +6,7 @@ import hashlib
 import logging
 import os
 import socket
+import time
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -201,7 +202,19 @@ def has_died(process: str) -> bool:
 
 def _process_has_died(run: Run) -> bool:
     tags = run.data.tags
-    return HOST_TAG in tags and PROCESS_TAG in tags and has_died(f"{tags[HOST_TAG]}:{tags[PROCESS_TAG]}")
+    if HOST_TAG not in tags or PROCESS_TAG not in tags:
+        return False
+    host = tags[HOST_TAG]
+    if host != machine() and host.partition(" ")[0] == socket.gethostname():
+        return run.info.start_time / 1000 < _booted()  # before a power failure, say
+    return has_died(f"{host}:{tags[PROCESS_TAG]}")
+
+
+def _booted() -> float:
+    """When this machine started, in seconds since 1970; 0 where that is not known."""
+    if not hasattr(time, "CLOCK_BOOTTIME"):
+        return 0.0
+    return time.time() - time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
 def flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -119,6 +119,18 @@ def test_a_machine_is_more_than_its_name(monkeypatch: pytest.MonkeyPatch) -> Non
         machine.cache_clear()
 
 
+@pytest.mark.parametrize(("began", "status"), [(1000, "KILLED"), (None, "RUNNING")])
+def test_runs_from_before_the_machine_started_are_closed(
+    began: int | None, status: str, logger: MLflowLogger, workplace: Workplace
+) -> None:
+    """As after a power failure; one of its name that began later is another machine's."""
+    tags = {"process.host": f"{socket.gethostname()} 01234567", "process.id": str(os.getppid())}
+    assert logger.client
+    run_id = logger.client.create_run(str(logger.experiment_id), start_time=began, tags=tags).info.run_id
+    following = MLflowLogger(tracking_uri=workplace.uri)
+    assert following.client.get_run(run_id).info.status == status
+
+
 @pytest.mark.parametrize(
     ("trial", "status"), [("dead", "KILLED"), ("alive", "RUNNING"), ("of another machine", "RUNNING")]
 )

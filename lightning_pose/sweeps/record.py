@@ -5,13 +5,14 @@ from __future__ import annotations
 from mlflow import MlflowClient
 from mlflow.exceptions import MlflowException
 from optuna import Study
+from optuna.trial import TrialState
 
 from lightning_pose.sweeps.plan import Plan
 from lightning_pose.sweeps.results import SHOWN, best_trials, short, tally
 from lightning_pose.sweeps.trial import RUN
 from lightning_pose.tracking import MLflowLogger
 
-__all__ = ["close_run", "describe_parent", "open_parent"]
+__all__ = ["close_parent", "close_run", "describe_parent", "open_parent"]
 
 
 def open_parent(study: Study, plan: Plan) -> tuple[MlflowClient, str]:
@@ -56,6 +57,12 @@ def describe_parent(client: MlflowClient, run: str, study: Study, plan: Plan) ->
         settings = ", ".join(f"{key.partition('.')[2]} {short(value)}" for key, value in trial.params.items())
         lines.append(f"| {trial.number} | {values} | {settings} |")
     client.set_tag(run, "mlflow.note.content", "\n".join(lines))
+
+
+def close_parent(client: MlflowClient, run: str, study: Study, status: str) -> None:
+    """End the study's run, unless another command has a trial under way, which ends it then."""
+    if not study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)) and _exists(client, run):
+        client.set_terminated(run, status)
 
 
 def close_run(client: MlflowClient, run: str | None, reason: str) -> None:
