@@ -45,7 +45,8 @@ run again. Trials are runs nested in the study's, and keep no checkpoints."""
 FILE_HELP = """a sweep file:
 
   base: ../configs/surf_cnn.yaml      # from this file's folder, the current one, or the repository
-  objective: val/position_median_m    # or a list, such as [val/position_median_m, cost/parameters]; default val/loss
+  objective: val/position_median_m    # or a list, such as [val/position_median_m, cost/parameters]; default val/loss,
+                                      # or this where the losses of several base configs differ
   sampler: tpe                        # gp, random, grid, cmaes, nsga2, nsga3, qmc; or {name: tpe, n_startup_trials: 5}
   pruner: median                      # none, percentile, hyperband, halving, threshold
   n_trials: 30
