@@ -24,7 +24,8 @@ class GraphConvolution(nn.Module):
             SAGEConv, GATConv, GATv2Conv or TransformerConv.
         in_width: columns of a node's state.
         out_width: columns of its new state.
-        aggr: how messages are brought together: `add`, `mean` or `max`; the convolution's own way if not given.
+        aggr: how messages are brought together: `add`, `mean` or `max`; the convolution's own way if not given, which
+            for `gcn` is a mean.
 
     Raises:
         ConfigError: there is no such convolution, or it cannot be built from two widths.
@@ -46,6 +47,8 @@ class GraphConvolution(nn.Module):
                 options["add_self_loops"] = False
             if self.is_gcn:
                 options["normalize"] = False  # it would need the degrees of sources, which nobody knows here
+                if aggr == "mean":
+                    del options["aggr"]  # its weights make the mean already, and a second one would leave little
             self.layer = kind(in_width, out_width, **options)
             with torch.no_grad():
                 shape = self(torch.zeros(1, in_width), torch.zeros(2, in_width), torch.tensor([[0, 1], [0, 0]])).shape
