@@ -13,7 +13,7 @@ from lightning_pose.errors import CheckpointError
 from lightning_pose.features.base import FeatureExtractor
 from lightning_pose.relative import RelativeFrame
 from lightning_pose.sequences import locate_sequence
-from lightning_pose.spec import build
+from lightning_pose.spec import build, resolve_class_paths
 
 if TYPE_CHECKING:
     from lightning_pose.models import ClipModule, PoseModule
@@ -22,7 +22,7 @@ __all__ = ["Localizer", "read_checkpoint"]
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
-    """A checkpoint's content, tensors memory-mapped on the CPU.
+    """A checkpoint's content, tensors memory-mapped on the CPU, classes by today's paths.
 
     Raises:
         CheckpointError: the file is missing, unreadable, or was not written by this project.
@@ -38,7 +38,7 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
         ) from error
     if not isinstance(checkpoint, dict) or "lightning_pose" not in checkpoint:
         raise CheckpointError(f"{path} was not written by lightning_pose; give a checkpoint that `fit` wrote")
-    return checkpoint
+    return checkpoint | {"lightning_pose": resolve_class_paths(checkpoint["lightning_pose"])}
 
 
 class Localizer:

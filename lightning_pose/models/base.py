@@ -15,7 +15,7 @@ from lightning_pose.errors import CheckpointError, ConfigError
 from lightning_pose.geometry import align_hemisphere, mean_quat, quat_normalize
 from lightning_pose.losses import LossConfig, PoseLoss
 from lightning_pose.metrics import PoseMetrics
-from lightning_pose.spec import Spec, class_path
+from lightning_pose.spec import Spec, class_path, resolve_class_path
 
 __all__ = ["Pose", "PoseModule"]
 
@@ -259,6 +259,7 @@ class PoseModule(LightningModule):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         saved = checkpoint.get("lightning_pose", {}).get("model", {}).get("class_path", class_path(self))
+        saved = resolve_class_path(saved)
         if saved != class_path(self):
             raise CheckpointError(
                 f"the checkpoint holds a {saved.rpartition('.')[2]}, not a {type(self).__name__}; "
