@@ -19,13 +19,13 @@ from lightning import Callback, LightningDataModule, Trainer
 from lightning.pytorch.callbacks import Timer
 
 from lightning_pose import models
-from lightning_pose.callbacks import BestCheckpoint, LastCheckpoint, RunRecorder
 from lightning_pose.data.batches import PoseBatch, PoseDataset, batch_loader
-from lightning_pose.data.scene import Scene
 from lightning_pose.features import SURF
-from lightning_pose.geometry import align_hemisphere, quat_normalize
-from lightning_pose.progress import EpochBar
-from lightning_pose.tracking import MLflowLogger
+from lightning_pose.geometry.quaternions import align_hemisphere, quat_normalize
+from lightning_pose.runs.epoch_bar import EpochBar
+from lightning_pose.runs.logger import MLflowLogger
+from lightning_pose.runs.recorder import BestCheckpoint, LastCheckpoint, RunRecorder
+from lightning_pose.scenes.scene import Scene
 
 
 class RandomData(LightningDataModule):

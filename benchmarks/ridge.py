@@ -20,7 +20,7 @@ import torch
 from sklearn.linear_model import Ridge
 from threadpoolctl import threadpool_limits
 
-from lightning_pose.ridge import Moments
+from lightning_pose.models.parts.ridge import Moments
 
 LAMBDA = 8.0
 LAMBDAS = [0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0]

@@ -2,11 +2,13 @@
 
 The data goes one way, and imports point along it:
 
-- `errors`, `geometry`, `images`: exceptions, quaternions, image files
-- `data.scene`, `data.formats`, `data.synthetic`: folders on disk -> `Scene`
+- `errors`, `paths`, `geometry`: exceptions, where files are kept, quaternions and poses
+- `scenes`: a folder on disk -> `Scene`
 - `features`: images -> SURF and other descriptors, cached
-- `data.datamodules`: Scene + features -> batches
+- `data`: Scene + features -> batches
 - `losses`, `metrics`, `models`: the architectures, one file each
-- `baselines`, `plots`, `callbacks`, `tracking`: what a run is measured against, and where it is kept
-- `localize`, `cli`: what users run
+- `localization`: a checkpoint -> poses of images
+- `runs`, `figures`, `evaluation`: MLflow, and what every test ends with
+- `sweeps`, `studies`, `reports`: tuning, the thesis's figures, tables of finished runs
+- `cli`, `commands`: what users run
 """

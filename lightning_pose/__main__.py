@@ -15,14 +15,14 @@ VERBS = {
     "validate": ("lightning_pose.cli", "measure a checkpoint on the validation frames"),
     "test": ("lightning_pose.cli", "measure a checkpoint on the test frames, beside its baselines"),
     "predict": ("lightning_pose.cli", "write a checkpoint's poses of the test frames as TUM files"),
-    "extract": ("lightning_pose.extract", "fill the feature cache: parallel, resumable"),
-    "sweep": ("lightning_pose.sweep", "search a config's settings, on validation frames: parallel, resumable"),
+    "extract": ("lightning_pose.commands.extract", "fill the feature cache: parallel, resumable"),
+    "sweep": ("lightning_pose.commands.sweep", "search a config's settings, on validation frames: parallel, resumable"),
     "report": (
-        "lightning_pose.report",
+        "lightning_pose.commands.report",
         "tables of finished runs: systems by scenes, beside baselines and published rows",
     ),
-    "check": ("lightning_pose.check", "say what a dataset holds, and what is wrong with it"),
-    "synth": ("lightning_pose.synth", "render a synthetic room as a dataset"),
+    "check": ("lightning_pose.commands.check", "say what a dataset holds, and what is wrong with it"),
+    "synth": ("lightning_pose.commands.synth", "render a synthetic room as a dataset"),
 }
 
 USAGE = """usage: python -m lightning_pose VERB [options]

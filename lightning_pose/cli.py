@@ -18,15 +18,15 @@ from lightning.pytorch.callbacks import Timer
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
-from lightning_pose.callbacks import BestCheckpoint, LastCheckpoint, RunRecorder, checkpoint_folder
 from lightning_pose.errors import CheckpointError, ConfigError
 from lightning_pose.evaluation import TestReport
-from lightning_pose.localize import read_checkpoint
+from lightning_pose.localization.localizer import read_checkpoint
+from lightning_pose.localization.sequences import chain_test
 from lightning_pose.models import ClipModule, PoseModule
-from lightning_pose.progress import EpochBar
-from lightning_pose.sequences import chain_test
-from lightning_pose.tracking import default_tracking_uri, last_run
-from lightning_pose.tum import write_sequences
+from lightning_pose.runs.epoch_bar import EpochBar
+from lightning_pose.runs.logger import default_tracking_uri, last_run
+from lightning_pose.runs.recorder import BestCheckpoint, LastCheckpoint, RunRecorder, checkpoint_folder
+from lightning_pose.scenes.trajectory_files import write_sequences
 
 __all__ = ["PoseCLI", "main"]
 
@@ -78,8 +78,8 @@ HELP = {
 Settings of an architecture, a data module, a feature extractor:
 
   fit --model.help lightning_pose.models.SurfLSTM
-  fit --data.help lightning_pose.data.datamodules.ImageDataModule
-  fit --data lightning_pose.data.datamodules.ImageDataModule --data.extractor.help lightning_pose.features.SURF""",
+  fit --data.help lightning_pose.data.ImageDataModule
+  fit --data lightning_pose.data.ImageDataModule --data.extractor.help lightning_pose.features.SURF""",
     "validate": """Measure a checkpoint on the validation frames. The checkpoint knows its architecture and its data.
 
   validate --ckpt_path mlruns/checkpoints/RUN_ID/best.ckpt""",
@@ -134,7 +134,7 @@ class PoseCLI(LightningCLI):
             trainer_defaults={
                 # The recorder comes first: a run has its name and tags before anything else can fail.
                 "callbacks": [self.recorder, Timer(), LastCheckpoint(), EpochBar()],
-                "logger": {"class_path": "lightning_pose.tracking.MLflowLogger"},
+                "logger": {"class_path": "lightning_pose.runs.logger.MLflowLogger"},
                 "default_root_dir": "mlruns",
                 "enable_model_summary": False,
                 "log_every_n_steps": 1,

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from lightning_pose.errors import ConfigError
-from lightning_pose.geometry import quat_normalize
+from lightning_pose.geometry.quaternions import quat_normalize
 
 __all__ = ["LossConfig", "PoseLoss"]
 

@@ -199,7 +199,7 @@ class Workplace:
                 "init_args": {"units": 8, "layers": 1, "learning_rate": 0.01, "schedule": "constant"},
             },
             "data": {
-                "class_path": "lightning_pose.data.datamodules.ImageDataModule",
+                "class_path": "lightning_pose.data.ImageDataModule",
                 "init_args": {
                     "extractor": {"class_path": "tests.helpers.Thumbnails"},
                     "root": str(scene),

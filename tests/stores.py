@@ -22,7 +22,7 @@ TAGS = {
     "task": "absolute",
     "image_size": "640x480",
 }
-PARAMS = {"data.class_path": "lightning_pose.data.datamodules.images.ImageDataModule", "data.val_fraction": "0.1"}
+PARAMS = {"data.class_path": "lightning_pose.data.image_datamodule.ImageDataModule", "data.val_fraction": "0.1"}
 
 
 @dataclass(frozen=True)

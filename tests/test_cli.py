@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from lightning_pose.localize import Localizer
+from lightning_pose.localization.localizer import Localizer
 from tests.helpers import Trained, Workplace
 
 DEAD_PROCESS = 2**22 + 1  # beyond the largest number that Linux gives

@@ -188,7 +188,7 @@ def test_a_finished_run_cannot_go_on(complaint: Complaint, workplace: Workplace,
 def test_an_architecture_for_other_data(complaint: Complaint, workplace: Workplace) -> None:
     line = complaint("fit", "--config", workplace.config, "--model", "lightning_pose.models.CNN3D")
     assert "CNN3D reads clips, but ImageDataModule gives images; set data.class_path to" in line
-    assert line.endswith("lightning_pose.data.datamodules.ClipDataModule")
+    assert line.endswith("lightning_pose.data.ClipDataModule")
     clips = ["--config", REPOSITORY / "configs" / "cnn_rnn.yaml", "--data.root", workplace.scene]
     line = complaint("fit", *clips, "--data.relative_frame", "world")
     assert "integrate composes camera motions, but data.relative_frame is world; set camera" in line
@@ -222,5 +222,5 @@ def test_a_model_that_reads_other_features(complaint: Complaint, workplace: Work
 
 
 def test_a_class_that_is_no_architecture(complaint: Complaint, workplace: Workplace) -> None:
-    line = complaint("fit", "--config", workplace.config, "--model", "lightning_pose.data.datamodules.ImageDataModule")
+    line = complaint("fit", "--config", workplace.config, "--model", "lightning_pose.data.ImageDataModule")
     assert re.search("ImageDataModule.*PoseModule", line), line

@@ -9,9 +9,9 @@ import pytest
 import torch
 import yaml
 
-from lightning_pose.geometry import orientation_error_deg, position_error_m
-from lightning_pose.localize import Localizer
-from lightning_pose.relative import absolute_poses
+from lightning_pose.geometry.quaternions import orientation_error_deg, position_error_m
+from lightning_pose.geometry.relative import absolute_poses
+from lightning_pose.localization.localizer import Localizer
 from tests.helpers import Trained, Workplace, write_scene
 
 
@@ -24,7 +24,7 @@ def clip_run(tmp_path_factory: pytest.TempPathFactory, scene: Path, store: Path)
         "class_path": "lightning_pose.models.CNN3D",
         "init_args": {"channels": 4, "units": 8, "integrate": True},
     }
-    config["data"]["class_path"] = "lightning_pose.data.datamodules.ClipDataModule"
+    config["data"]["class_path"] = "lightning_pose.data.ClipDataModule"
     config["data"]["init_args"] |= {"root": None, "train_scenes": [str(scene)], "clip_length": 4, "hop": 2}
     workplace.config.write_text(yaml.safe_dump(config))
     return Trained.make(workplace)

@@ -10,10 +10,10 @@ import pytest
 import yaml
 
 from lightning_pose.cli import PoseCLI
-from lightning_pose.data.synthetic import render_room
 from lightning_pose.features import LocalExtractor
+from lightning_pose.metrics.summary import RECALL_THRESHOLDS
 from lightning_pose.models import PoseModule
-from lightning_pose.summary import RECALL_THRESHOLDS
+from lightning_pose.scenes.synthetic import render_room
 from tests.helpers import REPOSITORY, Workplace
 
 CONFIGS = sorted((REPOSITORY / "configs").glob("*.yaml"))

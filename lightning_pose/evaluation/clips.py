@@ -10,19 +10,19 @@ from lightning import LightningModule, Trainer
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from lightning_pose import clip_plots
-from lightning_pose.clip_baselines import constant_velocity, no_motion
-from lightning_pose.data.clips import ClipDataset
-from lightning_pose.data.scene import Frame
-from lightning_pose.evaluation.base import Evaluation, costs, skill
-from lightning_pose.geometry import orientation_error_deg, position_error_m, quat_rotate
+from lightning_pose.data.clip_dataset import ClipDataset
+from lightning_pose.evaluation.baselines.clips import constant_velocity, no_motion
+from lightning_pose.evaluation.baselines.visual_odometry import visual_odometry
+from lightning_pose.evaluation.result import Evaluation, costs, skill
+from lightning_pose.figures import clips as clip_figures
+from lightning_pose.geometry.quaternions import orientation_error_deg, position_error_m, quat_rotate
+from lightning_pose.geometry.relative import absolute_poses, relative_poses
+from lightning_pose.localization.sequences import chain_test
+from lightning_pose.metrics.summary import summarize_errors
+from lightning_pose.metrics.trajectory import drift_by_length, mean_over_sequences, trajectory_errors
 from lightning_pose.models.base import Pose
 from lightning_pose.models.clip import ClipModule, layer_responses
-from lightning_pose.relative import absolute_poses, relative_poses
-from lightning_pose.sequences import chain_test
-from lightning_pose.summary import summarize_errors
-from lightning_pose.trajectories import drift_by_length, mean_over_sequences, trajectory_errors
-from lightning_pose.visual_odometry import visual_odometry
+from lightning_pose.scenes.scene import Frame
 
 __all__ = ["LENGTHS", "evaluate_clips"]
 
@@ -189,13 +189,13 @@ def _figures(
         for system in found[lengths[0]]
     }
     return {
-        "trajectory": clip_plots.relative_trajectories(
+        "trajectory": clip_figures.relative_trajectories(
             {title: s.truth.position_m.numpy() for title, s in shown.items()},
             {title: s.systems[name].position_m.numpy() for title, s in shown.items()},
             title=f"{name} on {scene.name}, chained from the start",
             unit=scene.unit,
         ),
-        "error_by_length": clip_plots.error_by_length(
+        "error_by_length": clip_figures.error_by_length(
             lengths, errors, title=f"{name} on {scene.name}", unit=scene.unit
         ),
     }
@@ -216,7 +216,7 @@ def _responses(datamodule: Any, module: LightningModule) -> Figure:
     middle = len(clip) // 2
     layers = {name: list(out[middle].numpy()) for name, out in layer_responses(module, clip).items()}  # type: ignore[arg-type]
     images = [image.permute(1, 2, 0).numpy() for image in clip]
-    return clip_plots.responses(images, layers, title=f"What {type(module).__name__} responds to")
+    return clip_figures.responses(images, layers, title=f"What {type(module).__name__} responds to")
 
 
 def _files(sequences: list[Sequence], name: str) -> dict[str, tuple[list[Frame], Pose]]:

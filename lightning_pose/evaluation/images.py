@@ -9,13 +9,13 @@ import torch
 from lightning import Trainer
 from matplotlib.figure import Figure
 
-from lightning_pose import plots
-from lightning_pose.baselines import BaselineResult, evaluate_baselines
 from lightning_pose.data.batches import PoseBatch
-from lightning_pose.data.scene import Scene
-from lightning_pose.evaluation.base import Evaluation, costs, skill
-from lightning_pose.geometry import orientation_error_deg, position_error_m
+from lightning_pose.evaluation.baselines.images import BaselineResult, evaluate_baselines
+from lightning_pose.evaluation.result import Evaluation, costs, skill
+from lightning_pose.figures import images as image_figures
+from lightning_pose.geometry.quaternions import orientation_error_deg, position_error_m
 from lightning_pose.models.base import Pose, PoseModule
+from lightning_pose.scenes.scene import Scene
 
 __all__ = ["evaluate_images"]
 
@@ -76,7 +76,7 @@ def _figures(
     model = errors.pop(name)
     about = f"{name} on {scene.name}"
     return {
-        "trajectory": plots.trajectory(
+        "trajectory": image_figures.trajectory(
             test.position_m.numpy(),
             poses[name].position_m.numpy(),
             [frame.sequence for frame in frames],
@@ -84,6 +84,8 @@ def _figures(
             title=about,
             unit=scene.unit,
         ),
-        "cumulative_errors": plots.cumulative_errors(model, errors, name, title=about, unit=scene.unit),
-        "error_vs_distance": plots.error_vs_distance(model[0], errors["oracle"][0], title=about, unit=scene.unit),
+        "cumulative_errors": image_figures.cumulative_errors(model, errors, name, title=about, unit=scene.unit),
+        "error_vs_distance": image_figures.error_vs_distance(
+            model[0], errors["oracle"][0], title=about, unit=scene.unit
+        ),
     }

@@ -5,8 +5,8 @@
 
 from lightning_pose.features.base import FeatureExtractor, LocalExtractor
 from lightning_pose.features.cache import FeatureCache, FillReport
-from lightning_pose.features.classical import BRIEF, FREAK, ORB, SIFT
 from lightning_pose.features.cnn import CNN
+from lightning_pose.features.opencv import BRIEF, FREAK, ORB, SIFT
 from lightning_pose.features.pixels import Pixels
 from lightning_pose.features.surf import SURF
 

@@ -11,7 +11,7 @@ import numpy as np
 from torch import Tensor
 
 from lightning_pose.errors import ConfigError
-from lightning_pose.images import read_gray, read_rgb
+from lightning_pose.scenes.images import read_gray, read_rgb
 
 __all__ = ["MIN_STORED_FEATURES", "FeatureExtractor", "LocalExtractor", "Record"]
 

@@ -23,9 +23,9 @@ from rich.text import Text
 
 from lightning_pose.errors import ConfigError, ImageError
 from lightning_pose.features.base import FeatureExtractor, Record
-from lightning_pose.features.store import TEMPORARY, DamagedError, read_record, write_record, write_whole
-from lightning_pose.folders import cache_folder
-from lightning_pose.images import decode_image, read_bytes
+from lightning_pose.features.record_files import TEMPORARY, DamagedError, read_record, write_record, write_whole
+from lightning_pose.paths import cache_folder
+from lightning_pose.scenes.images import decode_image, read_bytes
 
 __all__ = ["FeatureCache", "FillReport"]
 

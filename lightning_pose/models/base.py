@@ -10,12 +10,12 @@ import torch
 from lightning import LightningModule
 from torch import Tensor, nn
 
+from lightning_pose.checkpoint import Spec, class_path, resolve_class_path
 from lightning_pose.data.batches import PoseBatch
 from lightning_pose.errors import CheckpointError, ConfigError
-from lightning_pose.geometry import align_hemisphere, mean_quat, quat_normalize
+from lightning_pose.geometry.quaternions import align_hemisphere, mean_quat, quat_normalize
 from lightning_pose.losses import LossConfig, PoseLoss
-from lightning_pose.metrics import PoseMetrics
-from lightning_pose.spec import Spec, class_path, resolve_class_path
+from lightning_pose.metrics.pose_metrics import PoseMetrics
 
 __all__ = ["Pose", "PoseModule"]
 
@@ -182,7 +182,7 @@ class PoseModule(LightningModule):
             wanted, given = ("clips", "images") if self.reads_clips else ("images", "clips")
             raise ConfigError(
                 f"{type(self).__name__} reads {wanted}, but {type(datamodule).__name__} gives {given}; set "
-                f"data.class_path to lightning_pose.data.datamodules.{wanted.title()[:-1]}DataModule"
+                f"data.class_path to lightning_pose.data.{wanted.title()[:-1]}DataModule"
             )
 
     def setup(self, stage: str) -> None:

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor, nn
 
 from lightning_pose.errors import ConfigError
-from lightning_pose.geometry import quat_normalize, relative_pose
+from lightning_pose.geometry.quaternions import quat_normalize, relative_pose
+from lightning_pose.geometry.relative import chain_steps
 from lightning_pose.models.base import Pose, PoseModule
-from lightning_pose.models.motion import GEOMETRY_COLUMNS, MOTION_COLUMNS, matched_motion
-from lightning_pose.relative import chain_steps
+from lightning_pose.models.parts.motion import GEOMETRY_COLUMNS, MOTION_COLUMNS, matched_motion
 
 __all__ = ["ClipModule", "layer_responses"]
 

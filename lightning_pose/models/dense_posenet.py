@@ -11,7 +11,7 @@ from torch.nn import functional as F
 
 from lightning_pose.errors import ConfigError
 from lightning_pose.models.base import PoseModule
-from lightning_pose.ridge import Moments
+from lightning_pose.models.parts.ridge import Moments
 
 __all__ = ["DensePoseNet"]
 

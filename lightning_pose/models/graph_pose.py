@@ -7,10 +7,10 @@ from typing import Any, ClassVar, Literal, get_args
 import torch
 from torch import Tensor, nn
 
-from lightning_pose.data.graph import edge_index, neighbours_within
 from lightning_pose.errors import ConfigError
 from lightning_pose.models.base import PoseModule
-from lightning_pose.models.graph_conv import GraphConvolution, PoseHeads
+from lightning_pose.models.parts.graph_conv import GraphConvolution, PoseHeads
+from lightning_pose.models.parts.neighbour_graph import edge_index, neighbours_within
 
 __all__ = ["GraphPose"]
 

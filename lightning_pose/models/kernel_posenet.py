@@ -10,7 +10,7 @@ from torch.nn import functional as F
 
 from lightning_pose.errors import ConfigError
 from lightning_pose.models.linear_posenet import LinearPoseNet
-from lightning_pose.ridge import Ridge
+from lightning_pose.models.parts.ridge import Ridge
 
 __all__ = ["KernelPoseNet"]
 

@@ -12,9 +12,9 @@ from torch.nn import functional as F
 
 from lightning_pose.data.batches import PoseBatch
 from lightning_pose.errors import ConfigError
-from lightning_pose.geometry import align_hemisphere
+from lightning_pose.geometry.quaternions import align_hemisphere
 from lightning_pose.models.base import PoseModule
-from lightning_pose.ridge import Moments, Ridge
+from lightning_pose.models.parts.ridge import Moments, Ridge
 
 __all__ = ["LinearPoseNet"]
 

@@ -10,11 +10,11 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from lightning_pose.data.batches import PoseBatch
-from lightning_pose.data.graph import edge_index, neighbourhood, sample_neighbours, search_neighbours
 from lightning_pose.errors import ConfigError
-from lightning_pose.geometry import align_hemisphere
+from lightning_pose.geometry.quaternions import align_hemisphere
 from lightning_pose.models.base import PoseModule
-from lightning_pose.models.graph_conv import GraphConvolution, PoseHeads
+from lightning_pose.models.parts.graph_conv import GraphConvolution, PoseHeads
+from lightning_pose.models.parts.neighbour_graph import edge_index, neighbourhood, sample_neighbours, search_neighbours
 
 __all__ = ["NodePose"]
 

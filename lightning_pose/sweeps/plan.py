@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from lightning_pose.errors import ConfigError
-from lightning_pose.summary import summarize_errors
-from lightning_pose.sweeps.config import ParsedConfig, check_known, keys, options, put, read_yaml, resolve
-from lightning_pose.sweeps.exhibit import BASE, MEASURES, Exhibit, parse_exhibit
+from lightning_pose.metrics.summary import summarize_errors
+from lightning_pose.runs.logger import default_tracking_uri
+from lightning_pose.studies.figure_spec import BASE, MEASURES, Exhibit, parse_exhibit
+from lightning_pose.sweeps.base_config import ParsedConfig, check_known, keys, options, put, read_yaml, resolve
 from lightning_pose.sweeps.space import Parameter, by_class_path, check_when, nearest, parse_space
-from lightning_pose.tracking import default_tracking_uri
 
 __all__ = ["Objective", "Plan", "read_plan"]
 

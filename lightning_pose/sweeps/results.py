@@ -12,15 +12,15 @@ from optuna import Study
 from optuna.trial import FrozenTrial, TrialState
 
 from lightning_pose.errors import ConfigError
-from lightning_pose.sweeps.cells import Cell, as_csv, as_markdown, as_sheet, gather, varying
-from lightning_pose.sweeps.config import ParsedConfig
-from lightning_pose.sweeps.drawing import draw_cells, draw_keypoints
-from lightning_pose.sweeps.exhibit import SCENE, Exhibit
-from lightning_pose.sweeps.features import keypoints_of_a_frame
+from lightning_pose.studies.figure import draw_cells, draw_keypoints
+from lightning_pose.studies.figure_spec import SCENE, Exhibit
+from lightning_pose.studies.table import Cell, as_csv, as_markdown, as_sheet, gather, varying
+from lightning_pose.sweeps.base_config import ParsedConfig
+from lightning_pose.sweeps.keypoint_statistics import keypoints_of_a_frame
 from lightning_pose.sweeps.plan import Objective, Plan
 from lightning_pose.sweeps.space import nearest
-from lightning_pose.sweeps.terminal import Sheet
 from lightning_pose.sweeps.trial import REASON
+from lightning_pose.terminal import Sheet
 
 __all__ = [
     "SHOWN",

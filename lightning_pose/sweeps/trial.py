@@ -18,17 +18,17 @@ from mlflow.exceptions import MlflowException
 from optuna import Trial
 from optuna.exceptions import OptunaError
 
-from lightning_pose.callbacks import BestCheckpoint, checkpoint_folder, run_logger
 from lightning_pose.cli import PoseCLI
 from lightning_pose.errors import ConfigError, PoseError
 from lightning_pose.evaluation import TestReport
-from lightning_pose.evaluation.base import costs
-from lightning_pose.ridge import shared_factors
-from lightning_pose.sweeps.config import ParsedConfig
-from lightning_pose.sweeps.features import measure_features
+from lightning_pose.evaluation.result import costs
+from lightning_pose.models.parts.ridge import shared_factors
+from lightning_pose.runs.logger import PARENT_TAG, process_tags
+from lightning_pose.runs.recorder import BestCheckpoint, checkpoint_folder, run_logger
+from lightning_pose.sweeps.base_config import ParsedConfig
+from lightning_pose.sweeps.keypoint_statistics import measure_features
 from lightning_pose.sweeps.plan import Plan
 from lightning_pose.sweeps.space import draw
-from lightning_pose.tracking import PARENT_TAG, process_tags
 
 __all__ = ["CURVES", "METRICS", "PROCESS", "REASON", "RUN", "run_trial"]
 

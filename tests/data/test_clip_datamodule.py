@@ -8,11 +8,11 @@ from typing import Any
 import pytest
 import torch
 
-from lightning_pose.data.datamodules import ClipDataModule
+from lightning_pose.checkpoint import build
+from lightning_pose.data import ClipDataModule
 from lightning_pose.errors import ConfigError, DataError
 from lightning_pose.features import ORB, SURF, Pixels
-from lightning_pose.relative import relative_poses
-from lightning_pose.spec import build
+from lightning_pose.geometry.relative import relative_poses
 from tests.helpers import Thumbnails, write_scene
 
 
@@ -98,7 +98,7 @@ def test_clips_of_other_lengths(scene: Path) -> None:
 
 def test_nothing_named_is_rooms(monkeypatch: pytest.MonkeyPatch, scene: Path, other: Path) -> None:
     rooms = {3: scene, 5: other}
-    monkeypatch.setattr("lightning_pose.data.datamodules.clips.room_folder", lambda seed, frames: rooms[seed])
+    monkeypatch.setattr("lightning_pose.data.clip_datamodule.room_folder", lambda seed, frames: rooms[seed])
     data = module(train_rooms=[3], test_rooms=[5])
     assert data.scene.name == f"{scene.name} to other"
 

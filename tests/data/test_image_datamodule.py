@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 import torch
 
-from lightning_pose.data.datamodules import ImageDataModule, base
+from lightning_pose.checkpoint import build
+from lightning_pose.data import ImageDataModule, datamodule
 from lightning_pose.errors import ConfigError, DataError, ImageError
 from lightning_pose.features import ORB
-from lightning_pose.images import read_gray
-from lightning_pose.spec import build
+from lightning_pose.scenes.images import read_gray
 from tests.helpers import Thumbnails
 
 
@@ -110,7 +110,7 @@ def test_without_a_folder_a_room_is_rendered(monkeypatch: pytest.MonkeyPatch, tm
         return scene
 
     monkeypatch.setenv("LIGHTNING_POSE_CACHE", str(tmp_path))
-    monkeypatch.setattr(base, "render_room", render)
+    monkeypatch.setattr(datamodule, "render_room", render)
     data = ImageDataModule(Thumbnails(), room_seed=3, room_frames=50)
     assert asked == [], "not before it is needed"
     assert len(data.scene.frames) == 34

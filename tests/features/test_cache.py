@@ -21,8 +21,8 @@ from lightning_pose.errors import CacheError, ConfigError, ImageError
 from lightning_pose.features import cache as cache_module
 from lightning_pose.features.base import Record
 from lightning_pose.features.cache import FeatureCache
-from lightning_pose.features.classical import BRIEF
-from lightning_pose.features.store import read_record
+from lightning_pose.features.opencv import BRIEF
+from lightning_pose.features.record_files import read_record
 from tests.features.helpers import ColorMeans, write_images
 
 REPOSITORY = Path(__file__).parents[2]

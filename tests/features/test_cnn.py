@@ -16,9 +16,9 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from lightning_pose.checkpoint import build, describe
 from lightning_pose.errors import CheckpointError, ConfigError, ImageError
 from lightning_pose.features import CNN, FeatureCache
-from lightning_pose.spec import build, describe
 from tests.features.helpers import write_images
 
 CHANNELS = {

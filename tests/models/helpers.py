@@ -12,7 +12,7 @@ from torch.utils.data import DataLoader
 
 from lightning_pose import models
 from lightning_pose.data.batches import PoseBatch, PoseDataset, batch_loader
-from lightning_pose.data.clips import ClipDataset, ClipShape
+from lightning_pose.data.clip_dataset import ClipDataset, ClipShape
 from lightning_pose.models import PoseModule
 
 __all__ = [

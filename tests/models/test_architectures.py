@@ -10,12 +10,12 @@ import pytest
 import torch
 from lightning import Trainer
 
+from lightning_pose.checkpoint import build
 from lightning_pose.data.batches import PoseBatch
 from lightning_pose.errors import ConfigError
-from lightning_pose.geometry import orientation_error_deg, position_error_m
+from lightning_pose.geometry.quaternions import orientation_error_deg, position_error_m
 from lightning_pose.losses import LossConfig
 from lightning_pose.models import CNN3D, ClipModule, PoseModule
-from lightning_pose.spec import build
 from tests.models.helpers import ARCHITECTURES, CLIP_LENGTH, features_for, make_model, problem_for, random_poses
 
 Architecture = type[PoseModule]

@@ -14,7 +14,7 @@ from sklearn.preprocessing import KernelCenterer
 
 from lightning_pose.data.batches import PoseBatch
 from lightning_pose.errors import CheckpointError, ConfigError
-from lightning_pose.geometry import align_hemisphere
+from lightning_pose.geometry.quaternions import align_hemisphere
 from lightning_pose.models import KernelPoseNet
 from tests.models.test_linear_posenet import D, NoisyProblem
 

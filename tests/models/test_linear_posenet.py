@@ -14,12 +14,12 @@ from sklearn.linear_model import Ridge
 from sklearn.pipeline import make_pipeline
 from torch.utils.data import DataLoader
 
-from lightning_pose.callbacks import BestCheckpoint, LastCheckpoint
 from lightning_pose.data.batches import PoseBatch, PoseDataset, batch_loader
 from lightning_pose.errors import ConfigError
-from lightning_pose.geometry import align_hemisphere
+from lightning_pose.geometry.quaternions import align_hemisphere
 from lightning_pose.losses import LossConfig
 from lightning_pose.models import LinearPoseNet
+from lightning_pose.runs.recorder import BestCheckpoint, LastCheckpoint
 from tests.models.helpers import LearnableProblem, random_poses
 
 D = 16

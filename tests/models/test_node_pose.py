@@ -13,10 +13,10 @@ from torch import Tensor
 from torch_geometric.nn import GATConv, GCNConv, GraphConv
 
 from lightning_pose.data.batches import PoseBatch
-from lightning_pose.data.graph import edge_index, search_neighbours
 from lightning_pose.errors import CheckpointError, ConfigError
-from lightning_pose.geometry import align_hemisphere, orientation_error_deg
+from lightning_pose.geometry.quaternions import align_hemisphere, orientation_error_deg
 from lightning_pose.models import NodePose
+from lightning_pose.models.parts.neighbour_graph import edge_index, search_neighbours
 from tests.models.helpers import random_poses
 
 WIDTH = 16

@@ -10,12 +10,12 @@ import torch
 from lightning import Trainer
 from torch import Tensor, nn
 
+from lightning_pose.checkpoint import build
 from lightning_pose.data.batches import PoseBatch
 from lightning_pose.errors import CheckpointError, ConfigError
 from lightning_pose.features.backbones import build_backbone
 from lightning_pose.losses import LossConfig
 from lightning_pose.models import PoseNet
-from lightning_pose.spec import build
 from tests.models.helpers import LearnableProblem, make_model, random_poses
 
 SMALL = "tests.models.helpers.SmallCNN"

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from lightning_pose.reports.pick import Pick
-from lightning_pose.reports.store import read_runs
-from lightning_pose.reports.tables import Report, build_report
+from lightning_pose.reports.choose_run import Pick
+from lightning_pose.reports.table import Report, build_report
+from lightning_pose.runs.reader import read_runs
 from tests.stores import FakeRun, make_store
 
 

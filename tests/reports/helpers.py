@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from lightning_pose.reports.tables import Report
+from lightning_pose.reports.table import Report
 
 __all__ = ["shown"]
 

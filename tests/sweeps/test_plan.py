@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 import yaml
 
+from lightning_pose.commands.sweep import _read_value
 from lightning_pose.errors import ConfigError
-from lightning_pose.sweep import _read_value
-from lightning_pose.sweeps.config import ParsedConfig
+from lightning_pose.sweeps.base_config import ParsedConfig
 from lightning_pose.sweeps.plan import read_plan
 from tests.helpers import Workplace
 

@@ -14,8 +14,8 @@ from optuna.distributions import FloatDistribution
 from optuna.study import StudyDirection
 from optuna.trial import create_trial
 
+from lightning_pose.studies.table import Cell, name_scenes
 from lightning_pose.sweeps import results
-from lightning_pose.sweeps.cells import Cell, name_scenes
 from lightning_pose.sweeps.plan import Objective
 from tests.helpers import Workplace
 

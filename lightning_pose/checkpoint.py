@@ -1,0 +1,104 @@
+"""Plain descriptions of objects: a class path and plain constructor arguments, as config files write them."""
+
+from __future__ import annotations
+
+import inspect
+import sys
+from collections.abc import Mapping
+from importlib import import_module
+from typing import Any
+
+from lightning_pose.errors import CheckpointError
+
+__all__ = ["RENAMED_CLASSES", "Spec", "build", "class_path", "describe", "resolve_class_path", "resolve_class_paths"]
+
+Spec = dict[str, Any]
+"""`{"class_path": "package.module.Class", "init_args": {...}}`, plain types only."""
+
+_MODELS = {
+    "cnn_3d": "CNN3D",
+    "cnn_rnn": "CNNRNN",
+    "dense_posenet": "DensePoseNet",
+    "graph_pose": "GraphPose",
+    "kernel_posenet": "KernelPoseNet",
+    "linear_posenet": "LinearPoseNet",
+    "node_pose": "NodePose",
+    "posenet": "PoseNet",
+    "surf_cnn": "SurfCNN",
+    "surf_lstm": "SurfLSTM",
+}
+
+RENAMED_CLASSES = {
+    **{f"lightning_pose.models.{module}.{name}": f"lightning_pose.models.{name}" for module, name in _MODELS.items()},
+    "lightning_pose.features.classical.BRIEF": "lightning_pose.features.BRIEF",
+    "lightning_pose.features.classical.FREAK": "lightning_pose.features.FREAK",
+    "lightning_pose.features.classical.ORB": "lightning_pose.features.ORB",
+    "lightning_pose.features.classical.SIFT": "lightning_pose.features.SIFT",
+    "lightning_pose.features.cnn.CNN": "lightning_pose.features.CNN",
+    "lightning_pose.features.pixels.Pixels": "lightning_pose.features.Pixels",
+    "lightning_pose.features.surf.SURF": "lightning_pose.features.SURF",
+    "lightning_pose.data.datamodules.ImageDataModule": "lightning_pose.data.ImageDataModule",
+    "lightning_pose.data.datamodules.ClipDataModule": "lightning_pose.data.ClipDataModule",
+    "lightning_pose.data.datamodules.images.ImageDataModule": "lightning_pose.data.ImageDataModule",
+    "lightning_pose.data.datamodules.clips.ClipDataModule": "lightning_pose.data.ClipDataModule",
+    "lightning_pose.tracking.MLflowLogger": "lightning_pose.runs.logger.MLflowLogger",
+}
+"""Class paths that older checkpoints and configs have, to those of today. A path in here is never used again."""
+
+
+def resolve_class_path(path: str) -> str:
+    """Today's class path of a class that an older file names; the path itself where it was never renamed."""
+    return RENAMED_CLASSES.get(path, path)
+
+
+def resolve_class_paths(config: Any) -> Any:
+    """A config's or a spec's nested values, every `class_path` in them replaced by today's."""
+    if isinstance(config, Mapping):
+        return {
+            key: resolve_class_path(value)
+            if key == "class_path" and isinstance(value, str)
+            else resolve_class_paths(value)
+            for key, value in config.items()
+        }
+    if isinstance(config, list):
+        return [resolve_class_paths(value) for value in config]
+    return config
+
+
+def class_path(obj: object) -> str:
+    """The path by which users import an object's class: that of the outermost package that exports it.
+
+    `lightning_pose.models.SurfLSTM`, not `lightning_pose.models.surf_lstm.SurfLSTM`, so that files stay readable
+    when a module moves. A class that no package exports is named by its module.
+    """
+    cls = type(obj)
+    parts = cls.__module__.split(".")
+    for length in range(2, len(parts)):  # not the top package, which exports lazily
+        package = ".".join(parts[:length])
+        if getattr(sys.modules.get(package), cls.__qualname__, None) is cls:
+            return f"{package}.{cls.__qualname__}"
+    return f"{cls.__module__}.{cls.__qualname__}"
+
+
+def describe(obj: object) -> Spec:
+    """The spec of an object that keeps every constructor argument as an attribute of the same name."""
+    names = inspect.signature(type(obj)).parameters
+    return {"class_path": class_path(obj), "init_args": {name: getattr(obj, name) for name in names}}
+
+
+def build(spec: Mapping[str, Any]) -> Any:
+    """Make the object that a spec describes.
+
+    Raises:
+        CheckpointError: the class cannot be imported here, or does not take these arguments.
+    """
+    path = resolve_class_path(spec["class_path"])
+    module, _, name = path.rpartition(".")
+    try:
+        return getattr(import_module(module), name)(**spec["init_args"])
+    except (ImportError, AttributeError, ValueError) as error:
+        raise CheckpointError(f"{path} cannot be imported ({error}); install the package that has it") from error
+    except TypeError as error:
+        raise CheckpointError(
+            f"{path} does not take the saved settings ({error}); it was saved by another version, train it again"
+        ) from error

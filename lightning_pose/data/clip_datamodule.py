@@ -1,0 +1,166 @@
+"""ClipDataModule: clips of consecutive frames, of one scene or several."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+from torch.utils.data import DataLoader
+
+from lightning_pose.data.batches import PoseBatch, batch_loader
+from lightning_pose.data.clip_dataset import Augmentation, ClipDataset, ClipShape, find_runs
+from lightning_pose.data.datamodule import SceneDataModule, room_folder
+from lightning_pose.errors import ConfigError
+from lightning_pose.features import FeatureExtractor
+from lightning_pose.geometry.relative import RelativeFrame, check_relative_frame
+from lightning_pose.scenes.combine import join_scenes
+from lightning_pose.scenes.formats import load_scene
+from lightning_pose.scenes.scene import Scene
+
+__all__ = ["ClipDataModule"]
+
+LONGEST = 400
+"""Frames of the longest clip that the thesis tests."""
+
+
+class ClipDataModule(SceneDataModule):
+    """Clips of T consecutive frames of one sequence, with poses relative to each clip's first frame (eq. 6.1).
+
+    Scenes to train and to test on are named apart, so that a network can be tested where it has never been: a scene
+    that is only tested on gives its official test split, or all of its frames if it has none. With nothing named,
+    it trains on synthetic rooms and tests on another.
+
+    Args:
+        extractor: what the networks read of each frame, such as `lightning_pose.features.SURF`.
+        root: one scene's folder, to train and test on its own splits; instead of `train_scenes`.
+        train_scenes: folders of the scenes to train on.
+        test_scenes: folders of the scenes to test on; the scenes to train on if not given.
+        format: name of the dataset format of all scenes; recognised from each folder if not given.
+        clip_length: T, 2 to 400.
+        stride: from one frame of a clip to the next.
+        hop: from the first frame of a clip to that of the next; by default clips share one frame, so that they chain.
+            In training clips begin up to a hop later, at random.
+        relative_frame: axes of relative positions: `camera`, the first camera's, or `world`, as eq. 6.1 has them,
+            which no network can know in a scene that it has not seen.
+        max_stride: in training, take every k-th frame, k drawn up to this, so that the camera moves faster than it did;
+            1 or `stride` for none.
+        reverse: in training, play half of the clips backwards.
+        mirror: in training, mirror half of the clips; for upright SURF descriptors and pixels.
+        val_fraction: part of the training frames kept for validation, in blocks of a clip's span at least; 0 for none.
+        batch_size: clips in a training batch.
+        eval_batch_size: clips in a batch where no gradient is needed.
+        cache_dir: where extracted features are kept; the user's cache folder if not given.
+        workers: processes or threads that extract features; every core if not given.
+        train_rooms: which synthetic rooms to train on, where no scene is given.
+        test_rooms: which to test on.
+        room_frames: how many frames of each.
+
+    Raises:
+        ConfigError: a number is out of its range, or scenes are named in two ways.
+        DataError: a scene cannot be read, or no run of consecutive frames is as long as a clip.
+    """
+
+    gives_clips: ClassVar[bool] = True
+
+    def __init__(
+        self,
+        extractor: FeatureExtractor,
+        root: str | None = None,
+        train_scenes: list[str] | None = None,
+        test_scenes: list[str] | None = None,
+        format: str | None = None,
+        clip_length: int = 10,
+        stride: int = 1,
+        hop: int | None = None,
+        relative_frame: RelativeFrame = "camera",
+        max_stride: int = 1,
+        reverse: bool = False,
+        mirror: bool = False,
+        val_fraction: float = 0.1,
+        batch_size: int = 16,
+        eval_batch_size: int = 16,
+        cache_dir: str | None = None,
+        workers: int | None = None,
+        train_rooms: list[int] = [0],  # noqa: B006  (never changed; shown as it is in --help)
+        test_rooms: list[int] = [1],  # noqa: B006
+        room_frames: int = 300,
+    ) -> None:
+        super().__init__(extractor, batch_size, eval_batch_size, cache_dir, workers)
+        check_relative_frame(relative_frame)
+        if clip_length > LONGEST:
+            raise ConfigError(f"data.clip_length is {clip_length}; give 2 to {LONGEST} frames")
+        self._shape = ClipShape(clip_length, stride, hop)
+        _check_named_once(root, train_scenes, test_scenes)
+        self.root = root
+        self.train_scenes = train_scenes
+        self.test_scenes = test_scenes
+        self.format = format
+        self.clip_length = clip_length
+        self.stride = stride
+        self.hop = hop
+        self.relative_frame: RelativeFrame = relative_frame
+        self.reverse = reverse
+        self.mirror = mirror
+        self.max_stride = max_stride
+        if mirror:
+            extractor.check_mirror()
+        self.val_fraction = val_fraction
+        self.train_rooms = train_rooms
+        self.test_rooms = test_rooms
+        self.room_frames = room_frames
+
+    def _load_scene(self) -> Scene:
+        if self.root is not None:
+            train = test = self._load([self.root])
+        elif self.train_scenes is not None:
+            train = self._load(self.train_scenes)
+            test = train if self.test_scenes is None else self._load(self.test_scenes)
+        else:
+            train, test = (
+                self._load([room_folder(seed, self.room_frames) for seed in seeds])
+                for seeds in (self.train_rooms, self.test_rooms)
+            )
+        return join_scenes(train, test)
+
+    def _load(self, roots: Sequence[str | Path]) -> list[Scene]:
+        return [load_scene(root, self.format, self.val_fraction, val_block=self._shape.span) for root in roots]
+
+    def _make_dataset(self, split: str, data: PoseBatch) -> ClipDataset:
+        return self._clips(split, data, self._shape)
+
+    def clips(self, split: str, length: int) -> ClipDataset:
+        """A split's clips of another length.
+
+        Raises:
+            DataError: no run of consecutive frames is that long.
+        """
+        return self._clips(split, self.dataset(split).data, ClipShape(length, self.stride))
+
+    def longest_clip(self, split: str) -> int:
+        """The most frames that a clip of a split can have."""
+        runs = find_runs(self.scene, self.scene.splits[split])
+        return max(((len(run) - 1) // self.stride + 1 for run in runs), default=0)
+
+    def _clips(self, split: str, data: PoseBatch, shape: ClipShape, **settings: Any) -> ClipDataset:
+        runs = find_runs(self.scene, self.scene.splits[split])
+        return ClipDataset(data, runs, shape, self.relative_frame, **settings)
+
+    def train_dataloader(self) -> DataLoader[PoseBatch]:
+        data = self.dataset("train").data
+        clips = self._clips("train", data, self._shape, augmentation=self._augmentation())
+        return batch_loader(clips, self.batch_size, shuffle=True)
+
+    def _augmentation(self) -> Augmentation:
+        return Augmentation(True, self.max_stride, self.reverse, self.extractor.mirror if self.mirror else None)
+
+
+def _check_named_once(root: str | None, train_scenes: list[str] | None, test_scenes: list[str] | None) -> None:
+    if root is not None and (train_scenes or test_scenes):
+        raise ConfigError("data.root is one scene, and data.train_scenes and data.test_scenes are several; give either")
+    if test_scenes is not None and not train_scenes:
+        raise ConfigError(
+            f"data.test_scenes is {test_scenes}, but nothing to train on is named; give data.train_scenes"
+        )
+    if train_scenes == []:
+        raise ConfigError("data.train_scenes is empty; name a scene's folder, or leave it out for synthetic rooms")

@@ -1,0 +1,140 @@
+"""SceneDataModule: what the data modules share, from the scene to the features of a split in memory."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from lightning import LightningDataModule
+from torch.utils.data import DataLoader
+
+from lightning_pose.checkpoint import describe
+from lightning_pose.data.batches import PoseBatch, PoseDataset, batch_loader
+from lightning_pose.errors import ConfigError, DataError
+from lightning_pose.features import FeatureCache, FeatureExtractor
+from lightning_pose.features.cache import FillReport
+from lightning_pose.paths import cache_folder
+from lightning_pose.scenes.scene import Scene
+from lightning_pose.scenes.synthetic import RENDERER_VERSION, render_room
+
+__all__ = ["SceneDataModule", "room_folder"]
+
+
+def room_folder(seed: int, frames: int) -> Path:
+    """The synthetic room of that seed in the user's cache, rendered on first use."""
+    folder = cache_folder("rooms") / f"room-{seed}-{frames}-v{RENDERER_VERSION}"
+    return render_room(folder, seed, frames)
+
+
+class SceneDataModule(LightningDataModule):
+    """Scene -> cached features -> batches; of clips where `gives_clips` says so.
+
+    A child gives `_load_scene`, `train_dataloader`, and `_make_dataset` where a split is more than its frames. It
+    keeps every constructor argument as an attribute of the same name.
+
+    Args:
+        extractor: what the networks read, such as `lightning_pose.features.SURF`.
+        batch_size: items in a training batch.
+        eval_batch_size: items in a batch where no gradient is needed.
+        cache_dir: where extracted features are kept; the user's cache folder if not given.
+        workers: processes or threads that extract features; every core if not given.
+
+    Raises:
+        ConfigError: a number is out of its range.
+        DataError: the scene cannot be read, or a split that is needed is empty.
+    """
+
+    gives_clips: ClassVar[bool] = False
+
+    def __init__(
+        self,
+        extractor: FeatureExtractor,
+        batch_size: int,
+        eval_batch_size: int,
+        cache_dir: str | None,
+        workers: int | None,
+    ) -> None:
+        super().__init__()
+        for name, value in (("batch_size", batch_size), ("eval_batch_size", eval_batch_size)):
+            if value < 1:
+                raise ConfigError(f"data.{name} is {value}; give 1 or more")
+        self.extractor = extractor
+        self.batch_size = batch_size
+        self.eval_batch_size = eval_batch_size
+        self.cache_dir = cache_dir
+        self.workers = workers
+        self.cache = FeatureCache(extractor, cache_dir)
+        self._scene: Scene | None = None
+        self._datasets: dict[str, Any] = {}
+
+    @abstractmethod
+    def _load_scene(self) -> Scene:
+        """Read the scene, or render it."""
+
+    @property
+    def input_shape(self) -> tuple[int, ...]:
+        """Shape of one frame's features; the models are built for it."""
+        return self.extractor.feature_shape
+
+    @property
+    def scene(self) -> Scene:
+        """The scene, read (or rendered) on first use."""
+        if self._scene is None:
+            self._scene = self._load_scene()
+        return self._scene
+
+    def prepare_data(self) -> None:
+        self.fill()
+
+    def fill(self) -> FillReport:
+        """Extract what the cache lacks, for every split."""
+        used = sorted({int(i) for indices in self.scene.splits.values() for i in indices})
+        return self.cache.fill([self.scene.frames[i].image for i in used], workers=self.workers)
+
+    def dataset(self, split: str) -> Any:
+        """One of `train`, `val`, `test`, its features in memory; `data` holds them frame by frame."""
+        if split not in self._datasets:
+            self._datasets[split] = self._make_dataset(split, self._read(split, self.cache))
+        return self._datasets[split]
+
+    def _make_dataset(self, split: str, data: PoseBatch) -> Any:
+        return PoseDataset(data)
+
+    def _read(self, split: str, cache: FeatureCache) -> PoseBatch:
+        frames = [self.scene.frames[i] for i in self.scene.splits[split]]
+        return PoseBatch(
+            features=torch.from_numpy(cache.features([frame.image for frame in frames], workers=self.workers)),
+            position_m=_stack([frame.position_m for frame in frames], 3),
+            quat_wxyz=_stack([frame.quat_wxyz for frame in frames], 4),
+            frame=torch.as_tensor(self.scene.splits[split], dtype=torch.int64),
+        )
+
+    def val_dataloader(self) -> DataLoader[PoseBatch] | list[Any]:
+        if len(self.scene.splits["val"]):
+            return self._eval_loader("val")
+        if self.trainer is not None and self.trainer.validating:
+            raise DataError(f"{self.scene.root} has no validation frames; give data.val_fraction, such as 0.1")
+        return []
+
+    def test_dataloader(self) -> DataLoader[PoseBatch]:
+        if not len(self.scene.splits["test"]):
+            raise DataError(f"{self.scene.root} has no test frames; give it a test split")
+        return self._eval_loader("test")
+
+    predict_dataloader = test_dataloader
+
+    def _eval_loader(self, split: str) -> DataLoader[PoseBatch]:
+        return batch_loader(self.dataset(split), self.eval_batch_size, shuffle=False)
+
+    def describe(self) -> dict[str, Any]:
+        """Plain settings that rebuild this data module; checkpoints carry them."""
+        spec = describe(self)
+        spec["init_args"]["extractor"] = describe(self.extractor)
+        return spec
+
+
+def _stack(rows: list[np.ndarray], width: int) -> torch.Tensor:
+    return torch.from_numpy(np.asarray(rows, dtype=np.float32).reshape(-1, width))

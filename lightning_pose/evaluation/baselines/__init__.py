@@ -1,0 +1,1 @@
+"""What every model is measured against: of single images, of clips, and classical visual odometry."""

@@ -1,0 +1,108 @@
+"""The callback that ends every test: baselines beside the model, costs, figures, prediction files, and one table."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from lightning import LightningModule, Trainer
+from lightning.pytorch.callbacks import Callback
+
+from lightning_pose.evaluation.clips import evaluate_clips
+from lightning_pose.evaluation.images import evaluate_images
+from lightning_pose.evaluation.result import Evaluation
+from lightning_pose.evaluation.table import print_results, results_markdown
+from lightning_pose.models.base import Pose, PoseModule
+from lightning_pose.models.clip import ClipModule
+from lightning_pose.runs.logger import MLflowLogger, log_localizer
+from lightning_pose.runs.recorder import checkpoint_folder, run_logger
+from lightning_pose.scenes.scene import Frame
+from lightning_pose.scenes.trajectory_files import write_sequences
+
+__all__ = ["NOTE", "TestReport", "describe_run"]
+
+NOTE = "mlflow.note.content"
+"""The tag that MLflow shows as a run's description, in Markdown."""
+
+
+class TestReport(Callback):
+    """Gathers the test's predictions and, at its end, logs and prints all that belongs beside them.
+
+    Args:
+        log_model: keep a model in the run that `mlflow.pyfunc.load_model` loads.
+        visual_odometry: for models of clips, match images to compare with; about 0.1 s a frame.
+    """
+
+    __test__ = False  # not a test case, whatever pytest makes of its name
+
+    def __init__(self, log_model: bool = True, visual_odometry: bool = True) -> None:
+        self.log_model = log_model
+        self.visual_odometry = visual_odometry
+        self.results: dict[str, Mapping[str, float]] = {}
+        self.evaluation: Evaluation | None = None
+        self._poses: list[Pose] = []
+
+    def on_test_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._poses = []
+
+    def on_test_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, *args: Any, **kwargs: Any
+    ) -> None:
+        self._poses.append(Pose(*(tensor.float().cpu() for tensor in outputs)))
+
+    def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if not trainer.is_global_zero:
+            return
+        model = {
+            name.removeprefix("test/"): float(value)
+            for name, value in trainer.callback_metrics.items()
+            if name.startswith("test/")
+        }
+        if isinstance(pl_module, ClipModule):
+            found = evaluate_clips(trainer, pl_module, model, self.visual_odometry)
+        else:
+            assert isinstance(pl_module, PoseModule)
+            found = evaluate_images(trainer, pl_module, self._poses, model)
+        self.evaluation = found
+        self.results = {type(pl_module).__name__: model, **found.baselines}
+        scene = trainer.datamodule.scene  # type: ignore[attr-defined]
+        print_results(self.results, f"{scene.name}, {pl_module.headline}", found.extras)
+        logger = run_logger(trainer)
+        if logger is None:
+            return
+        _log(logger, found)
+        describe_run(logger, results_markdown(self.results, found.extras))
+        best = checkpoint_folder(trainer) / "best.ckpt"
+        if self.log_model and best.is_file():
+            log_localizer(logger, best)
+        print(f"run {logger.run_id} in {logger.uri}")
+
+
+def _log(logger: MLflowLogger, found: Evaluation) -> None:
+    """Keep an evaluation in the run."""
+    logger.log_metrics(
+        found.extras | {f"baseline/{k}/{name}": v for k, r in found.baselines.items() for name, v in r.items()}
+    )
+    for name, curve in found.curves.items():
+        for number, value in curve.items():
+            logger.log_metrics({name: value}, step=number)
+    _log_trajectories(logger, found.trajectories)
+    for file, figure in found.figures.items():
+        logger.client.log_figure(str(logger.run_id), figure, f"figures/{file}.png")
+
+
+def describe_run(logger: MLflowLogger, text: str) -> None:
+    """Make the table the run's description, unless a user has written one."""
+    run = str(logger.run_id)
+    written = logger.client.get_run(run).data.tags.get(NOTE)
+    if not written or written.startswith("| test |"):
+        logger.client.set_tag(run, NOTE, text)
+
+
+def _log_trajectories(logger: MLflowLogger, trajectories: Mapping[str, tuple[list[Frame], Pose]]) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        for name, (frames, pose) in trajectories.items():
+            write_sequences(Path(folder) / name, frames, pose.position_m.numpy(), pose.quat_wxyz.numpy())
+        logger.client.log_artifacts(str(logger.run_id), folder, "trajectories")

@@ -1,0 +1,1 @@
+"""Figures: `images` for single images, `clips` for clips."""

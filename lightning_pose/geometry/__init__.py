@@ -1,0 +1,1 @@
+"""Pure functions on poses: `quaternions` and pose errors, `relative` poses along clips."""

@@ -1,0 +1,99 @@
+"""A trained localizer: images in, poses out, from one checkpoint file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+import torch
+
+from lightning_pose.checkpoint import build, resolve_class_paths
+from lightning_pose.errors import CheckpointError
+from lightning_pose.features.base import FeatureExtractor
+from lightning_pose.geometry.relative import RelativeFrame
+from lightning_pose.localization.sequences import locate_sequence
+
+if TYPE_CHECKING:
+    from lightning_pose.models import ClipModule, PoseModule
+
+__all__ = ["Localizer", "read_checkpoint"]
+
+
+def read_checkpoint(path: str | Path) -> dict[str, Any]:
+    """A checkpoint's content, tensors memory-mapped on the CPU, classes by today's paths.
+
+    Raises:
+        CheckpointError: the file is missing, unreadable, or was not written by this project.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise CheckpointError(f"{path} is no file; give a checkpoint such as mlruns/checkpoints/RUN_ID/best.ckpt")
+    try:
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    except Exception as error:  # torch raises half a dozen kinds for a file that is no checkpoint
+        raise CheckpointError(
+            f"{path} cannot be read as a checkpoint; it is damaged or another kind of file"
+        ) from error
+    if not isinstance(checkpoint, dict) or "lightning_pose" not in checkpoint:
+        raise CheckpointError(f"{path} was not written by lightning_pose; give a checkpoint that `fit` wrote")
+    return checkpoint | {"lightning_pose": resolve_class_paths(checkpoint["lightning_pose"])}
+
+
+class Localizer:
+    """An extractor and a network, restored from a checkpoint.
+
+    Args:
+        extractor: makes the features.
+        model: makes the poses.
+        clips: for a model of clips, how many frames one has and in which axes it answers.
+    """
+
+    def __init__(
+        self, extractor: FeatureExtractor, model: PoseModule, clips: tuple[int, RelativeFrame] | None = None
+    ) -> None:
+        self.extractor = extractor
+        self.model = model.eval()
+        self.clips = clips
+
+    @classmethod
+    def from_checkpoint(cls, path: str | Path) -> Localizer:
+        """Restore a localizer from a checkpoint that `fit` wrote.
+
+        Raises:
+            CheckpointError: the file cannot be read, or holds no data settings.
+        """
+        checkpoint = read_checkpoint(path)
+        specs = checkpoint["lightning_pose"]
+        if specs["data"] is None:
+            raise CheckpointError(f"{path} does not say which features it reads; train with a data module")
+        model: PoseModule = build(specs["model"])
+        model.load_state_dict(checkpoint["state_dict"])
+        data = specs["data"]["init_args"]
+        clips = (data["clip_length"], data["relative_frame"]) if "clip_length" in data else None
+        return cls(build(data["extractor"]), model, clips)
+
+    def __call__(self, images: Sequence[str | Path | np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """Locate images.
+
+        Args:
+            images: M files, or uint8 arrays as `extractor.color` asks for: (H, W) gray or (H, W, 3) RGB.
+
+        Returns:
+            position_m (M, 3) and quat_wxyz (M, 4), camera-to-world. A model of clips takes the images for a video, in
+            order, and the first camera for the world.
+
+        Raises:
+            ImageError: an image cannot be read.
+        """
+        read = self.extractor.read
+        arrays = [image if isinstance(image, np.ndarray) else read(image) for image in images]
+        records = self.extractor.extract(arrays)
+        features = torch.from_numpy(np.stack([self.extractor.features(record) for record in records]))
+        if self.clips is not None:
+            chained = locate_sequence(cast("ClipModule", self.model), features, *self.clips)
+            return chained[0].numpy(), chained[1].numpy()
+        with torch.inference_mode():
+            pose = self.model(features)
+        return pose.position_m.numpy(), pose.quat_wxyz.numpy()

@@ -1,0 +1,42 @@
+"""The localizer as an MLflow model: a table of image files in, a table of poses out.
+
+MLflow runs this file when it loads the model, which is safer than a pickle: the last line names the model.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from mlflow.models import set_model
+from mlflow.pyfunc.model import PythonModel, PythonModelContext
+
+from lightning_pose.localization.localizer import Localizer
+
+__all__ = ["LocalizerModel"]
+
+COLUMNS = ["x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"]
+
+
+class LocalizerModel(PythonModel):
+    """What `mlflow.pyfunc.load_model` gives back for a run's `model`."""
+
+    def load_context(self, context: PythonModelContext) -> None:
+        self.localizer = Localizer.from_checkpoint(context.artifacts["checkpoint"])
+
+    def predict(self, context: Any, model_input: list[str], params: dict[str, Any] | None = None) -> pd.DataFrame:
+        """Locate images.
+
+        Args:
+            context: MLflow's.
+            model_input: image files; MLflow makes this list of a table with one column, too.
+            params: none are used.
+
+        Returns:
+            One row an image: camera centre in metres and camera-to-world quaternion.
+        """
+        return pd.DataFrame(np.hstack(self.localizer(model_input)), columns=pd.Index(COLUMNS))
+
+
+set_model(LocalizerModel())

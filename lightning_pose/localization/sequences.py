@@ -1,0 +1,77 @@
+"""Whole sequences from a model of clips: windows that share a frame, chained from the first frame on."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from lightning_pose.geometry.relative import Chain, RelativeFrame
+
+if TYPE_CHECKING:
+    from lightning_pose.data import ClipDataModule
+    from lightning_pose.models.clip import ClipModule
+
+__all__ = ["Chained", "chain_test", "locate_sequence", "windows"]
+
+
+def windows(frames: int, length: int) -> list[range]:
+    """Clips of up to `length` frames that cover a sequence of `frames`, each beginning where the last one ended."""
+    return [range(start, min(start + length, frames)) for start in range(0, max(1, frames - 1), length - 1)]
+
+
+def locate_sequence(
+    model: ClipModule,
+    features: Tensor,
+    clip_length: int,
+    relative_frame: RelativeFrame = "camera",
+    first_position_m: Tensor | None = None,
+    first_quat_wxyz: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    """The trajectory of a sequence of any length.
+
+    Args:
+        model: in evaluation mode.
+        features: (M, *input_shape) of the sequence's frames, in order.
+        clip_length: frames of a clip, 2 or more, as the model was trained.
+        relative_frame: the axes it was trained with.
+        first_position_m: (3,) where the first frame is; the origin if not given.
+        first_quat_wxyz: (4,) likewise; the identity if not given.
+
+    Returns:
+        position_m (M, 3) and quat_wxyz (M, 4), float64.
+    """
+    chain = Chain(relative_frame, first_position_m, first_quat_wxyz)
+    for window in windows(len(features), clip_length):
+        with torch.inference_mode():
+            pose = model(features[window.start : window.stop].unsqueeze(0).to(model.device))
+        chain.add(list(window), pose.position_m[0], pose.quat_wxyz[0])
+    _, position_m, quat_wxyz = chain.trajectory()
+    return position_m, quat_wxyz
+
+
+class Chained(NamedTuple):
+    """A run of test frames, M of them, and where a model says they are.
+
+    Attributes:
+        rows: (M,) rows of the test split's data.
+        position_m: (M, 3) float64, from the true position of the first frame.
+        quat_wxyz: (M, 4) float64, from its true orientation.
+    """
+
+    rows: Tensor
+    position_m: Tensor
+    quat_wxyz: Tensor
+
+
+def chain_test(model: ClipModule, datamodule: ClipDataModule) -> list[Chained]:
+    """Trajectories of the test split's runs of two frames or more, each from the true pose of its first frame."""
+    data, model = datamodule.dataset("test").data, model.eval()
+    found = []
+    for rows in (torch.from_numpy(run[:: datamodule.stride]) for run in datamodule.dataset("test").runs):
+        if len(rows) > 1:
+            first = data.position_m[rows[0]], data.quat_wxyz[rows[0]]
+            clips = datamodule.clip_length, datamodule.relative_frame
+            found.append(Chained(rows, *locate_sequence(model, data.features[rows], *clips, *first)))
+    return found

@@ -1,0 +1,63 @@
+"""The metrics of a split, gathered batch by batch and over processes."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torchmetrics import Metric
+
+from lightning_pose.geometry.quaternions import orientation_error_deg, position_error_m
+from lightning_pose.metrics.summary import RECALL_THRESHOLDS, summarize_errors
+
+__all__ = ["RECALL_THRESHOLDS", "PoseMetrics", "summarize_errors"]
+
+
+class PoseMetrics(Metric):
+    """Median, mean and 95th percentile errors and recalls over all frames seen (see `summarize_errors`).
+
+    Keeps every frame's errors, because medians do not add up; under DDP they are gathered before `compute`.
+    """
+
+    is_differentiable = False
+    higher_is_better = None
+    full_state_update = False
+
+    position_error_m: list[Tensor]
+    orientation_error_deg: list[Tensor]
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.add_state("position_error_m", default=[], dist_reduce_fx="cat")
+        self.add_state("orientation_error_deg", default=[], dist_reduce_fx="cat")
+
+    def update(self, position_hat: Tensor, quat_hat: Tensor, position: Tensor, quat: Tensor) -> None:
+        """Add frames.
+
+        Args:
+            position_hat: (..., 3) predicted, metres.
+            quat_hat: (..., 4) predicted wxyz, of any length and sign.
+            position: (..., 3) true, metres.
+            quat: (..., 4) true wxyz.
+        """
+        position_error = position_error_m(_full(position_hat), _full(position))
+        orientation_error = orientation_error_deg(_full(quat_hat), _full(quat))
+        self.position_error_m.append(position_error.detach().flatten())
+        self.orientation_error_deg.append(orientation_error.detach().flatten())
+
+    def compute(self) -> dict[str, float]:
+        """The summary of all frames.
+
+        Raises:
+            ConfigError: no frame was added.
+        """
+        return summarize_errors(_cat(self.position_error_m), _cat(self.orientation_error_deg))
+
+
+def _full(x: Tensor) -> Tensor:
+    """At least single precision: the half precision that autocast leaves rounds metres to centimetres."""
+    return x.to(torch.promote_types(x.dtype, torch.float32))
+
+
+def _cat(state: list[Tensor] | Tensor) -> Tensor:
+    """One vector of a state, which is a list before the processes' parts are gathered and a tensor after."""
+    return state if isinstance(state, Tensor) else torch.cat([torch.empty(0), *(s.cpu() for s in state)])

@@ -1,0 +1,188 @@
+"""How good a whole trajectory is: absolute and relative pose error by `evo`, and drift by length, as KITTI has it."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lightning_pose.errors import ConfigError, DataError
+from lightning_pose.geometry.quaternions import orientation_error_deg, position_error_m, quat_normalize, relative_pose
+
+if TYPE_CHECKING:
+    from evo.core.trajectory import PosePath3D
+
+__all__ = ["Drift", "drift_by_length", "mean_over_sequences", "trajectory_errors"]
+
+Array = Tensor | np.ndarray
+Poses = tuple[Tensor, Tensor]  # position_m (M, 3) and quat_wxyz (M, 4), float64 on the CPU
+
+METRICS: tuple[str, ...] = ("ate_rmse_m", "ate_origin_rmse_m", "rpe_rmse_m", "rpe_rmse_deg")
+
+
+class Drift(NamedTuple):
+    """Errors at the end of sub-trajectories relative to their own start, each an array (L,), a value a length.
+
+    NaN stands where no sub-trajectory is that long, and in `percent` also where none of them moved.
+    """
+
+    lengths: np.ndarray
+    """Steps from start to end: one less than the number of images in a clip."""
+    position_m: np.ndarray
+    """Median error of the end's position."""
+    orientation_deg: np.ndarray
+    """Median error of the end's orientation."""
+    percent: np.ndarray
+    """Median of position error by the distance truly travelled, over those that moved, times 100."""
+    starts: np.ndarray
+    """How many sub-trajectories the medians are of: one a start."""
+
+
+def trajectory_errors(position_hat: Array, quat_hat: Array, position: Array, quat: Array) -> dict[str, float]:
+    """Absolute and relative errors of one sequence's trajectory (Sturm et al., IROS 2012), as `evo` measures them.
+
+    - `ate_rmse_m`: position error once the whole trajectory is laid on the truth by the best rotation and
+      translation, without scale (Umeyama, PAMI 1991): `evo_ape -a`. It measures the shape alone. Where the best
+      rotation is not unique (the camera keeps to a line, or stands still), the error is: that of any of them.
+    - `ate_origin_rmse_m`: position error once the first poses coincide: `evo_ape --align_origin`. How far it drifts.
+    - `rpe_rmse_m`, `rpe_rmse_deg`: error of each step, from a row to the next: `evo_rpe --delta 1`.
+
+    NaN is what a sequence is too short to tell: `ate_rmse_m` of fewer than three poses, which can be laid on almost
+    anything, and all four of fewer than two. A prediction with a pose that is not finite has infinite errors, so that
+    losing track never looks better than drifting.
+
+    Args:
+        position_hat: (M, 3) predicted camera centres, metres, in any world: they are aligned here.
+        quat_hat: (M, 4) predicted, wxyz, camera-to-world; any length, normalised here.
+        position: (M, 3) true.
+        quat: (M, 4) true.
+
+    Raises:
+        ConfigError: shapes do not fit.
+        DataError: a true pose is not finite.
+    """
+    hat, truth = _checked(position_hat, quat_hat, position, quat)
+    n_poses = len(truth[0])
+    if n_poses < 2:
+        return dict.fromkeys(METRICS, math.nan)
+    finite = all(bool(part.isfinite().all()) for part in hat)
+    errors = _measured(hat, truth) if finite else dict.fromkeys(METRICS, math.inf)
+    return errors if n_poses > 2 else errors | {"ate_rmse_m": math.nan}
+
+
+def mean_over_sequences(per_sequence: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
+    """Mean of each metric, every sequence counting once, whatever its length.
+
+    A sequence whose metric is NaN (too short to tell) is left out of that metric's mean, which is NaN where none has
+    it. An infinite error stays, and makes the mean infinite.
+
+    Args:
+        per_sequence: sequence to metrics, as `trajectory_errors` gives them.
+    """
+    names = dict.fromkeys(name for metrics in per_sequence.values() for name in metrics)
+    means = {}
+    for name in names:
+        values = [metrics[name] for metrics in per_sequence.values() if not math.isnan(metrics.get(name, math.nan))]
+        means[name] = statistics.fmean(values) if values else math.nan
+    return means
+
+
+def drift_by_length(
+    position_hat: Array, quat_hat: Array, position: Array, quat: Array, lengths: Sequence[int]
+) -> Drift:
+    """How far off a sub-trajectory ends, by its length, from every start (Geiger et al., CVPR 2012, but in frames).
+
+    Args:
+        position_hat: (M, 3) predicted camera centres of one sequence, metres, in any world.
+        quat_hat: (M, 4) predicted, wxyz, camera-to-world; any length, normalised here.
+        position: (M, 3) true.
+        quat: (M, 4) true.
+        lengths: L numbers of steps, 1 or more: a clip of T images has T - 1.
+
+    Returns:
+        a `Drift`; a prediction that is not finite counts as infinitely far off.
+
+    Raises:
+        ConfigError: shapes do not fit, or a length below 1.
+        DataError: a true pose is not finite.
+    """
+    if min(lengths, default=1) < 1:
+        raise ConfigError(f"lengths has {min(lengths)}, but a sub-trajectory has one step at least; give 1 or more")
+    hat, truth = _checked(position_hat, quat_hat, position, quat)
+    rows = [_drift(hat, truth, int(length)) for length in lengths]
+    metres, degrees, percent, starts = np.array(rows, float).reshape(len(rows), 4).T
+    return Drift(np.array(lengths, int), metres, degrees, percent, starts.astype(int))
+
+
+def _checked(position_hat: Array, quat_hat: Array, position: Array, quat: Array) -> tuple[Poses, Poses]:
+    parts = [torch.as_tensor(part).detach().cpu().double() for part in (position_hat, quat_hat, position, quat)]
+    shapes = [tuple(part.shape) for part in parts]
+    n_poses = shapes[2][0] if shapes[2] else 0
+    if shapes != [(n_poses, 3), (n_poses, 4)] * 2:
+        raise ConfigError(f"shapes of poses are {shapes}; give (M, 3), (M, 4), (M, 3), (M, 4) with one M")
+    bad = (~torch.cat(parts[2:], dim=1).isfinite().all(dim=1)).nonzero().flatten()
+    if len(bad):
+        raise DataError(f"{len(bad)} true poses are not finite, the first in row {int(bad[0])}; leave those frames out")
+    return (parts[0], quat_normalize(parts[1])), (parts[2], quat_normalize(parts[3]))
+
+
+def _measured(hat: Poses, truth: Poses) -> dict[str, float]:
+    from evo.core.metrics import APE, RPE, PoseRelation, StatisticsType  # brings in scipy's rotations: half a second
+    from evo.core.trajectory import PosePath3D
+
+    # evo aligns in place, and copies what it is given
+    reference, shape, anchored = (PosePath3D(p.numpy(), q.numpy()) for p, q in (truth, hat, hat))
+    _align(shape, reference)
+    anchored.align_origin(reference)
+    metres, degrees = PoseRelation.translation_part, PoseRelation.rotation_angle_deg
+    measures = {
+        "ate_rmse_m": (APE(metres), shape),
+        "ate_origin_rmse_m": (APE(metres), anchored),
+        "rpe_rmse_m": (RPE(metres, delta=1), anchored),
+        "rpe_rmse_deg": (RPE(degrees, delta=1), anchored),
+    }
+    for metric, path in measures.values():
+        metric.process_data((reference, path))
+    return {name: float(metric.get_statistic(StatisticsType.rmse)) for name, (metric, _) in measures.items()}
+
+
+def _align(path: PosePath3D, reference: PosePath3D) -> None:
+    """Move a path onto the reference by the least squares of its positions, where `evo` refuses too.
+
+    It does where the rotation is not unique: on a straight line, or where either stands still. The least squares are
+    the same for all the best rotations, so one of them serves. To align by the translation alone would not: the
+    error of a straight walk would leap with the last digit of its straightness.
+    """
+    from evo.core.geometry import GeometryException
+
+    try:
+        path.align(reference)
+    except GeometryException:
+        points, targets = path.positions_xyz, reference.positions_xyz
+        centre, target = points.mean(axis=0), targets.mean(axis=0)
+        left, _, right = np.linalg.svd((targets - target).T @ (points - centre))
+        left[:, 2] *= np.sign(np.linalg.det(left) * np.linalg.det(right))  # a rotation, not a mirror
+        move = np.eye(4)
+        move[:3, :3] = left @ right
+        move[:3, 3] = target - move[:3, :3] @ centre
+        path.transform(move)
+
+
+def _drift(hat: Poses, truth: Poses, length: int) -> tuple[float, float, float, int]:
+    """Medians in metres, degrees and percent over all starts, and how many starts there are."""
+    count = len(truth[0]) - length
+    if count < 1:
+        return math.nan, math.nan, math.nan, 0
+    moved_hat, moved = (relative_pose(p[:-length], q[:-length], p[length:], q[length:]) for p, q in (hat, truth))
+    metres, degrees = position_error_m(moved_hat[0], moved[0]), orientation_error_deg(moved_hat[1], moved[1])
+    metres, degrees = (errors.where(errors.isfinite(), math.inf).numpy() for errors in (metres, degrees))
+    steps = position_error_m(truth[0][1:], truth[0][:-1])
+    distance = steps.unfold(0, length, 1).sum(dim=1).numpy()
+    travelled = distance > 0
+    percent = np.median(100 * metres[travelled] / distance[travelled]) if travelled.any() else math.nan
+    return float(np.median(metres)), float(np.median(degrees)), float(percent), count

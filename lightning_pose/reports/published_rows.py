@@ -1,0 +1,197 @@
+"""Reference rows for the scenes on show: chosen, merged where tables agree, and marked as published."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from lightning_pose.reports.comparability import tested
+from lightning_pose.reports.published_tables import FRAMES, MEANS, REMARKS, SCENES, TABLES
+from lightning_pose.reports.table import Cell, Mean, Report, Row, add_means
+
+__all__ = ["CHAPTERS", "Published", "add_published", "published_systems"]
+
+CHAPTERS = (2, 3, 4, 5, 6)
+SOURCE = (
+    "published, not measured here: A. Elmoogy, Efficient Image Based Localization Using Machine Learning Techniques, "
+    "University of Victoria"
+)
+SEVEN = 7
+GROUND_TRUTHS = {"7scenes": "original", "cambridge": "sfm"}
+"""What the published errors of a dataset were measured against."""
+
+
+@dataclass(frozen=True)
+class Published:
+    """A row of a published table.
+
+    Attributes:
+        system: as the table names it.
+        table: number of the table.
+        task: `absolute`, or `relative` for poses within clips.
+        cells: by scene, in the names of `thesis.SCENES`.
+    """
+
+    system: str
+    table: str
+    task: str
+    cells: dict[str, Cell]
+
+
+def published_systems(chapters: Iterable[int] = CHAPTERS) -> list[Published]:
+    """The rows of the thesis's tables 2.3, 3.2, 4.1, 5.2 and 6.1.
+
+    Args:
+        chapters: whose tables.
+    """
+    wanted = tuple(f"{chapter}." for chapter in chapters)
+    return [
+        _parse(line, table, order.split())
+        for table, order, text in TABLES
+        if table.startswith(wanted)
+        for line in text.strip().splitlines()
+        if line.strip()
+    ]
+
+
+def add_published(report: Report, chapters: Sequence[int] = ()) -> None:
+    """Append the reference rows of the scenes on show, with their sources and what keeps them from comparing.
+
+    Args:
+        report: gets rows, notes and footnotes.
+        chapters: of the thesis; all, and means of other papers, if none is given.
+    """
+    columns = {scene: name for scene in report.scenes if (name := _known(report, scene))}
+    if not columns:
+        report.notes.append(
+            f"no published row: none of the scenes on show ({', '.join(report.scenes)}) is one of 7-Scenes "
+            f"or Cambridge with its original ground truth ({', '.join(SCENES)})"
+        )
+        return
+    rows: list[Row] = []
+    tables: set[str] = set()
+    left_out: set[str] = set()
+    for published in published_systems(chapters or CHAPTERS):
+        cells = {}
+        for scene, name in columns.items():
+            if name in published.cells:
+                if report.facts[scene].get("task", published.task) != published.task:
+                    left_out.add(published.task)
+                    continue
+                cells[scene] = published.cells[name]
+        if cells:
+            tables.add(published.table)
+            _merge(rows, published, cells)
+    add_means(report, rows)
+    means = _means(report, columns) if not chapters else []
+    report.rows += rows + means
+    report.notes += [f"published rows of {task} poses are left out: those on show are not" for task in sorted(left_out)]
+    report.notes += [_comparable(report, columns)] if rows or means else ["no published row has the task on show"]
+    report.footnotes += _footnotes(sorted(tables), bool(means), set(columns.values()))
+
+
+def _parse(line: str, table: str, scenes: Sequence[str]) -> Published:
+    found = re.fullmatch(rf"(.+?)((?:\s+(?:[\d.]+(?:/[\d.]+)?|-)){{{len(scenes)}}})", line.strip())
+    assert found, line
+    system, texts = found[1].strip(), found[2].split()
+    cells = {scene: _cell(text) for scene, text in zip(scenes, texts, strict=True) if text != "-"}
+    return Published(system, table, "relative" if system.endswith("clips") else "absolute", cells)
+
+
+def _cell(text: str) -> Cell:
+    position, _, orientation = text.partition("/")
+    return Cell(float(position), float(orientation) if orientation else None, text=(position, orientation))
+
+
+def _known(report: Report, scene: str) -> str | None:
+    """The published name of a scene on show; that of the scene tested on, for a model trained elsewhere."""
+    facts = report.facts[scene]
+    truth = GROUND_TRUTHS.get(tested(scene, facts, "dataset") or "7scenes")
+    if truth is None or (tested(scene, facts, "ground_truth") or truth) != truth:
+        return None
+    return SCENES.get(re.sub("[ _-]", "", scene.rpartition(" to ")[2].lower()))
+
+
+def _merge(rows: list[Row], published: Published, cells: dict[str, Cell]) -> None:
+    """One row for tables that agree in all the cells on show."""
+    for row in rows:
+        if row.system == published.system and _values(row.cells) == _values(cells):
+            row.source += f", {published.table}"
+            row.features = row.source
+            return
+    source = f"table {published.table}"
+    rows.append(Row("published", published.system, source, cells, source=source))
+
+
+def _values(cells: dict[str, Cell]) -> dict[str, tuple[float, float | None]]:
+    return {scene: (cell.position_m, cell.orientation_deg) for scene, cell in cells.items()}
+
+
+def _means(report: Report, columns: dict[str, str]) -> list[Row]:
+    """Means over the seven scenes, which stand beside means over just these."""
+    absolute = {scene for scene in columns if report.facts[scene].get("task", "absolute") == "absolute"}
+    seven = set(list(SCENES.values())[:SEVEN])
+    for column, scenes in report.means.items():
+        if len(scenes) == SEVEN and {columns[scene] for scene in scenes if scene in absolute} == seven:
+            return [_row_of_mean(column, *published) for published in MEANS]
+    if absolute:
+        report.notes.append("published means over the seven scenes are left out: other scenes, or fewer, are on show")
+    return []
+
+
+def _row_of_mean(column: str, system: str, source: str, text: str) -> Row:
+    cell = _cell(text)
+    mean = Mean(cell.position_m, cell.orientation_deg, SEVEN)
+    return Row("published", system, source, {}, means={column: mean}, source=source)
+
+
+def _comparable(report: Report, columns: dict[str, str]) -> str:
+    """Whether the scenes on show are what was published."""
+    reasons = [why for scene, name in columns.items() for why in _differences(scene, name, report.facts[scene])]
+    if not reasons:
+        return "published rows are of the same official test frames; image sizes and training may differ"
+    return f"published rows are of the whole official test split and do not compare: {'; '.join(reasons)}"
+
+
+def _differences(scene: str, name: str, facts: Mapping[str, str]) -> list[str]:
+    """What keeps the errors on a scene from comparing with published ones."""
+    reasons = []
+    told, whole = facts.get("test_frames"), str(FRAMES[name])
+    # A scene that was only tested on gives the frames of its official split, and tells that it is unseen.
+    if facts.get("split", "official") not in ("official", "unseen"):
+        reasons.append(f"{scene} has its own split ({facts['split']})")
+    elif told is None:
+        reasons.append(f"{scene} may be a cut, no run tells how many of the {whole} test frames it has")
+    elif told != whole:
+        reasons.append(f"{scene} is a cut, {told} test frames of {whole}")
+    if facts.get("task") == "relative" and _seen(scene, facts):
+        asked = scene.rpartition(" to ")[2]
+        reasons.append(f"{asked} was seen in training, the scenes of published clips were not")
+    return reasons
+
+
+def _seen(scene: str, facts: Mapping[str, str]) -> bool:
+    """Whether the scene tested on was trained on, by the split or, where no run tells that, by the names."""
+    if "split" in facts:
+        return facts["split"] != "unseen"
+    learned, apart, asked = scene.rpartition(" to ")
+    return not apart or asked in learned.split("+")
+
+
+def _footnotes(tables: Sequence[str], means: bool, scenes: set[str]) -> list[str]:
+    notes = []
+    if tables:
+        notes.append(
+            f"{SOURCE}, table{'s' if len(tables) > 1 else ''} {', '.join(tables)}: cells as printed, means recomputed "
+            "from them, so that the tables' own averages may differ; the chapters disagree with each other in places"
+        )
+        notes += [remark for about, remark in REMARKS.items() if about in (*tables, *scenes)]
+    if means:
+        notes.append("means over the seven scenes, original ground truth, as the literature quotes them: no cells")
+    if notes:
+        notes.append(
+            "all of these regress or retrieve poses; structure-based systems, such as ACE and hloc, are ten times "
+            "more accurate"
+        )
+    return notes

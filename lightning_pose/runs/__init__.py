@@ -1,0 +1,1 @@
+"""MLflow, both ways: `logger` and `recorder` write runs, `reader` reads them."""

@@ -1,0 +1,288 @@
+"""Where runs are kept: an MLflow logger with the project's defaults, and the model that MLflow can load."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import socket
+import time
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lightning.fabric.utilities.rank_zero import rank_zero_only
+from lightning.pytorch.loggers import MLFlowLogger
+
+from lightning_pose.errors import CheckpointError
+
+if TYPE_CHECKING:
+    from mlflow import MlflowClient
+    from mlflow.entities import Run
+
+__all__ = [
+    "PARENT_TAG",
+    "MLflowLogger",
+    "default_tracking_uri",
+    "flatten",
+    "has_died",
+    "last_run",
+    "log_localizer",
+    "machine",
+    "process_name",
+    "process_tags",
+]
+
+REQUIREMENTS = (
+    "torch",
+    "lightning",
+    "opencv-contrib-python-headless",
+    "numpy",
+    "scipy",
+    "jsonargparse",
+    "safetensors",
+    "platformdirs",
+    "rich",
+)
+"""What a logged model needs beside this package, which it carries along."""
+
+PACKAGE = Path(__file__).parents[1]
+
+STORE_VARIABLE = "MLFLOW_TRACKING_URI"
+HOST_TAG, PROCESS_TAG = "process.host", "process.id"
+PARENT_TAG = "mlflow.parentRunId"
+
+
+def default_tracking_uri(root: str | Path = "mlruns") -> str:
+    """`MLFLOW_TRACKING_URI`, or a database under `root`."""
+    return os.environ.get(STORE_VARIABLE) or f"sqlite:///{Path(root) / 'mlflow.db'}"
+
+
+class MLflowLogger(MLFlowLogger):
+    """Lightning's MLflow logger, with a database by default and honest endings.
+
+    A run that a user or a signal stops ends as KILLED and one that breaks as FAILED. A run whose process was killed
+    outright is found by the next run on the same machine, and marked KILLED then.
+
+    Args:
+        experiment_name: MLflow experiment.
+        run_name: name of the run; derived from architecture, scene and main setting if not given.
+        tracking_uri: MLflow store; `MLFLOW_TRACKING_URI`, else `sqlite:///mlruns/mlflow.db`.
+        run_id: continue this run.
+        root: folder of the default database and its artifacts.
+    """
+
+    def __init__(
+        self,
+        experiment_name: str = "lightning_pose",
+        run_name: str | None = None,
+        tracking_uri: str | None = None,
+        run_id: str | None = None,
+        root: str = "mlruns",
+    ) -> None:
+        # alembic and mlflow announce each table of a new database on the terminal.
+        for noisy in ("alembic", "mlflow.store.db.utils", "mlflow.tracking.fluent"):
+            logging.getLogger(noisy).setLevel(logging.WARNING)
+        logging.getLogger("lightning.pytorch.loggers.mlflow").setLevel(logging.ERROR)  # a first experiment is no news
+        uri = tracking_uri or default_tracking_uri(root)
+        local = uri.startswith("sqlite:///")
+        if local:
+            Path(uri.removeprefix("sqlite:///")).parent.mkdir(parents=True, exist_ok=True)
+        super().__init__(
+            experiment_name=experiment_name,
+            run_name=run_name,
+            tracking_uri=uri,
+            run_id=run_id,
+            artifact_location=(Path(root) / "artifacts").resolve().as_uri() if local else None,
+        )
+        self.stopped_as = "FAILED"
+        self._claimed = False
+
+    @property
+    def experiment(self) -> MlflowClient:
+        """The MLflow client of the store, with the run created: Lightning's name of it."""
+        with _environment_kept():
+            return super().experiment
+
+    @property
+    def client(self) -> MlflowClient:
+        """The MLflow client of the store, with the run created, and this process its owner."""
+        client = self.experiment
+        if not self._claimed:
+            self._claimed = True
+            # A run that goes on belongs to this process now; the tags of the dead one would have it closed.
+            for name, value in process_tags().items():
+                client.set_tag(str(self.run_id), name, value)
+            self._close_stale_runs(client)
+        return client
+
+    @property
+    def uri(self) -> str:
+        """The tracking store's address."""
+        return self._tracking_uri
+
+    def _close_stale_runs(self, client: MlflowClient) -> None:
+        """Mark runs of this machine whose process is gone: nothing could mark them when they died.
+
+        A sweep's run has the process of whichever command came last, and lives as long as one of its trials does.
+        """
+        running = client.search_runs([str(self.experiment_id)], "attributes.status = 'RUNNING'")
+        dead = [run for run in running if run.info.run_id != self.run_id and _process_has_died(run)]
+        closed = {run.info.run_id for run in dead}
+        held = {run.data.tags.get(PARENT_TAG) for run in running if run.info.run_id not in closed}
+        for run_id in closed - held:
+            client.set_terminated(run_id, "KILLED")
+
+    @rank_zero_only
+    def log_hyperparams(self, params: Any) -> None:
+        """Log what the run does not have yet: MLflow refuses to change a parameter, and a resumed run may."""
+        known = self.client.get_run(str(self.run_id)).data.params
+        flat = flatten(params)
+        super().log_hyperparams({name: value for name, value in flat.items() if name not in known})
+
+    @rank_zero_only
+    def finalize(self, status: str = "success") -> None:
+        """End the run: FINISHED, or `stopped_as` where Lightning says that it failed."""
+        if self._initialized:
+            self.client.set_terminated(str(self.run_id), self.stopped_as if status == "failed" else "FINISHED")
+
+
+@contextmanager
+def _environment_kept() -> Iterator[None]:
+    """MLflow writes the store that it is told into `MLFLOW_TRACKING_URI`, where the next logger would read it."""
+    before = os.environ.get(STORE_VARIABLE)
+    try:
+        yield
+    finally:
+        os.environ.pop(STORE_VARIABLE, None)
+        if before is not None:
+            os.environ[STORE_VARIABLE] = before
+
+
+@cache
+def machine() -> str:
+    """This machine: its name for people, and what tells it from others of that name, its own earlier boots included.
+
+    Process numbers mean something within one boot only, and within one container where it counts its own.
+    """
+    facts = []
+    with suppress(OSError):  # Linux alone has them
+        facts.append(Path("/proc/sys/kernel/random/boot_id").read_text().strip())
+    with suppress(OSError):
+        facts.append(str(Path("/proc/self/ns/pid").stat().st_ino))
+    digest = hashlib.sha256(" ".join(facts).encode()).hexdigest()[:8]
+    return f"{socket.gethostname()} {digest}" if facts else socket.gethostname()
+
+
+def process_name() -> str:
+    """This process, on whatever machine."""
+    return f"{machine()}:{os.getpid()}"
+
+
+def process_tags() -> dict[str, str]:
+    """By which a later run finds out that this process has died."""
+    return {HOST_TAG: machine(), PROCESS_TAG: str(os.getpid())}
+
+
+def has_died(process: str) -> bool:
+    """Whether a process, by its `process_name`, was of this machine and is gone; of other machines nothing is known."""
+    host, _, number = process.rpartition(":")
+    if host != machine():
+        return False
+    try:
+        os.kill(int(number), 0)
+    except ProcessLookupError:
+        return True
+    except PermissionError:
+        pass
+    return False
+
+
+def _process_has_died(run: Run) -> bool:
+    tags = run.data.tags
+    if HOST_TAG not in tags or PROCESS_TAG not in tags:
+        return False
+    host = tags[HOST_TAG]
+    if host != machine() and host.partition(" ")[0] == socket.gethostname():
+        return run.info.start_time / 1000 < _booted()  # before a power failure, say
+    return has_died(f"{host}:{tags[PROCESS_TAG]}")
+
+
+def _booted() -> float:
+    """When this machine started, in seconds since 1970; 0 where that is not known."""
+    if not hasattr(time, "CLOCK_BOOTTIME"):
+        return 0.0
+    return time.time() - time.clock_gettime(time.CLOCK_BOOTTIME)
+
+
+def flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings by dotted name; `init_args` is left out, so `model.units` and not `model.init_args.units`."""
+    flat: dict[str, Any] = {}
+    for key, value in config.items():
+        name = prefix if key == "init_args" else f"{prefix}.{key}" if prefix else str(key)
+        if isinstance(value, Mapping):
+            flat |= flatten(value, name)
+        else:
+            flat[name] = value
+    return flat
+
+
+def last_run(
+    uri: str, experiment_name: str, checkpoints: Path, architecture: str, data: Mapping[str, Any]
+) -> tuple[str, Path]:
+    """The newest run of an architecture on a scene that left a `last.ckpt`.
+
+    Args:
+        uri: MLflow store.
+        experiment_name: MLflow experiment.
+        checkpoints: folder of the runs' checkpoint folders.
+        architecture: class name.
+        data: which scenes it trains on: settings of the data module by name, such as `root`.
+
+    Returns:
+        The run's id and its last checkpoint.
+
+    Raises:
+        CheckpointError: there is no such run.
+    """
+    from mlflow import MlflowClient
+
+    client = MlflowClient(uri)
+    experiment = client.get_experiment_by_name(experiment_name)
+    scenes = " and ".join(f'params.`data.{name}` = "{value}"' for name, value in data.items())
+    query = f"tags.architecture = '{architecture}' and {scenes}"
+    runs = client.search_runs([experiment.experiment_id], query) if experiment else []  # newest first
+    for run in runs:
+        checkpoint = checkpoints / run.info.run_id / "last.ckpt"
+        if checkpoint.is_file():
+            return run.info.run_id, checkpoint
+    told = " ".join(f"data.{name}={value}" for name, value in data.items())
+    raise CheckpointError(
+        f"no run of {architecture} on {told} left a last.ckpt under {checkpoints}; leave --ckpt_path out to start one"
+    )
+
+
+def log_localizer(logger: MLflowLogger, checkpoint: Path) -> None:
+    """Keep a localizer in the run as `model`, for `mlflow.pyfunc.load_model`."""
+    import mlflow
+
+    os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
+    # uv has no pip; a table is no type hint; and it tells of a lock file that it copies.
+    for noisy in ("mlflow.utils.environment", "mlflow.models.signature", "mlflow.utils.uv_utils"):
+        logging.getLogger(noisy).setLevel(logging.ERROR)
+    with _environment_kept(), warnings.catch_warnings():
+        # The model takes files, for which MLflow has no schema; it warns of that in its own way.
+        warnings.simplefilter("ignore", UserWarning)
+        mlflow.set_tracking_uri(logger.uri)
+        with mlflow.start_run(run_id=str(logger.run_id)):
+            mlflow.pyfunc.log_model(
+                name="model",
+                python_model=str(PACKAGE / "localization" / "mlflow_model.py"),
+                artifacts={"checkpoint": str(checkpoint)},
+                code_paths=[str(PACKAGE)],
+                pip_requirements=[f"{name}=={version(name)}" for name in REQUIREMENTS],
+            )

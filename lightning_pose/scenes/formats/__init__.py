@@ -1,0 +1,79 @@
+"""Folders on disk -> `Scene`: one module per format; `base` says how to add one."""
+
+from __future__ import annotations
+
+import pkgutil
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+
+from lightning_pose.errors import ConfigError, DataError
+from lightning_pose.scenes.formats.base import SceneFormat
+from lightning_pose.scenes.scene import Scene
+from lightning_pose.scenes.splits import make_splits
+
+__all__ = ["SceneFormat", "known_formats", "load_scene"]
+
+
+def known_formats() -> dict[str, SceneFormat]:
+    """Every format by its name: the `FORMAT` of each module of this package."""
+    modules = (import_module(f"{__name__}.{info.name}") for info in pkgutil.iter_modules(__path__))
+    formats = [module.FORMAT for module in modules if hasattr(module, "FORMAT")]
+    return {format.name: format for format in formats}
+
+
+def load_scene(
+    root: Path | str,
+    format: str | None = None,
+    val_fraction: float = 0.1,
+    test_fraction: float = 0.2,
+    val_block: int = 1,
+) -> Scene:
+    """Read a folder of posed images.
+
+    Args:
+        root: the scene's folder.
+        format: name of its format; recognised from the files where it is None.
+        val_fraction: part of the training frames to validate on, see `splits`; 0 for none.
+        test_fraction: part of all frames to test on, where the format has no official split.
+        val_block: validation frames come in runs of this many at least, where sequences are that long.
+
+    Returns:
+        the scene with `train`, `val` and `test`; no image has been decoded.
+
+    Raises:
+        ConfigError: no format has that name, or a fraction is out of range.
+        DataError: the folder is missing or of no known format, or a file of it is missing or malformed.
+    """
+    root = Path(root).expanduser()
+    if not root.is_dir():
+        raise DataError(f"{root} is not a folder; give the folder of a scene")
+    scene = _format(root, format).read(root)
+    source = "official" if scene.splits else "blocks"
+    return replace(scene, splits=make_splits(scene, val_fraction, test_fraction, val_block), split_source=source)
+
+
+def _format(root: Path, name: str | None) -> SceneFormat:
+    """The format of that name, or the only one that the folder matches."""
+    formats = known_formats()
+    if name is not None:
+        if name not in formats:
+            raise ConfigError(f"format {name!r} is unknown; the formats are {', '.join(sorted(formats))}")
+        return formats[name]
+    matching = _matching(root)
+    if len(matching) > 1:
+        raise DataError(f"{root} may be {' or '.join(matching)}; say which with `format`")
+    if matching:
+        return formats[matching[0]]
+    scenes = [child.name for child in sorted(root.iterdir()) if child.is_dir() and _matching(child)]
+    if scenes:
+        raise DataError(f"{root} is no dataset itself but holds {', '.join(scenes)}; give one of these")
+    looked = "; ".join(f"{format.name}: {format.looks_for}" for format in formats.values())
+    raise DataError(
+        f"{root} holds no dataset of a known format, looked for {looked}; "
+        "give the folder that has these files, or force a format with `format`"
+    )
+
+
+def _matching(root: Path) -> list[str]:
+    return [name for name, format in known_formats().items() if format.matches(root)]

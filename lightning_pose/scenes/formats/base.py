@@ -1,0 +1,176 @@
+"""What every format on disk must give, and the reading and checking that several of them share."""
+
+from __future__ import annotations
+
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from lightning_pose.errors import DataError, ImageError
+from lightning_pose.scenes.scene import Frame, Scene
+
+__all__ = [
+    "SceneFormat",
+    "natural_key",
+    "ordered",
+    "poses_from_matrices",
+    "read_lines",
+    "read_table",
+    "require_images",
+    "unit_quats",
+]
+
+MAX_SKEW = 1e-2
+"""Largest entry of R^T R - 1 that still counts as rounding; 7-Scenes' own poses reach 3e-4."""
+
+
+class SceneFormat(ABC):
+    """Reads one layout of posed images; nothing else in the project knows how it looks on disk.
+
+    To add a format, put one module into this package with a subclass that gives
+
+    - `name`: what a user writes as `format`;
+    - `looks_for`: the files that give the format away, in words, for messages;
+    - `matches`: whether a folder is of this format, by the presence of those files, quickly;
+    - `read`: the scene, poses camera-to-world with OpenCV axes, `splits` holding `train` and `test` where
+      the format has an official split and nothing where it has none (`load_scene` makes the rest);
+
+    and an instance of it named `FORMAT`. It is found by itself.
+    """
+
+    name: ClassVar[str]
+    looks_for: ClassVar[str]
+
+    @abstractmethod
+    def matches(self, root: Path) -> bool:
+        """Whether the folder looks like this format."""
+
+    @abstractmethod
+    def read(self, root: Path) -> Scene:
+        """Read every posed frame, without decoding an image.
+
+        Raises:
+            DataError: a file is missing or malformed; the message names it.
+        """
+
+
+def read_lines(path: Path) -> list[tuple[int, str]]:
+    """The lines that hold data, stripped, with their numbers from 1: no blank lines, no `#` comments.
+
+    Raises:
+        DataError: the file is missing or is not text.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError as error:
+        raise DataError(f"{path} is missing; repeat the download or the unpacking") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{path} cannot be read as text ({error}); restore the original") from error
+    lines = ((number, line.strip()) for number, line in enumerate(text.splitlines(), start=1))
+    return [(number, line) for number, line in lines if line and not line.startswith("#")]
+
+
+def read_table(path: Path, columns: str) -> tuple[np.ndarray, list[str]]:
+    """A table of finite numbers.
+
+    Args:
+        path: text file, one row a line, separated by blanks, tabs or commas.
+        columns: names of the columns, for the message.
+
+    Returns:
+        (N, number of columns) float64, and N strings `path:line` for later messages.
+
+    Raises:
+        DataError: a line has another number of columns, or an entry is not a finite number.
+    """
+    rows, where = [], []
+    for number, line in read_lines(path):
+        place = f"{path}:{number}"
+        try:
+            row = [float(item) for item in line.replace(",", " ").split()]
+        except ValueError:
+            row = []
+        if len(row) != len(columns.split()) or not np.isfinite(row).all():
+            raise DataError(f"{place}: expected finite numbers `{columns}`, found `{line}`; correct the line")
+        rows.append(row)
+        where.append(place)
+    return np.array(rows, dtype=np.float64).reshape(-1, len(columns.split())), where
+
+
+def poses_from_matrices(T_world_cam: np.ndarray, where: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and quaternions of (N, 4, 4) camera-to-world matrices.
+
+    A rotation that is off by rounding is replaced by the nearest one (SVD).
+
+    Args:
+        T_world_cam: (N, 4, 4).
+        where: the file of each matrix, for messages.
+
+    Returns:
+        (N, 3) positions and (N, 4) unit quaternions wxyz, w >= 0, float64.
+
+    Raises:
+        DataError: an entry is not finite, the last row is not 0 0 0 1, or the rotation is scaled, skewed
+            or mirrored.
+    """
+    finite = np.isfinite(T_world_cam).sum(axis=(1, 2))
+    _refuse(finite < 16, where, T_world_cam, "the pose has NaN or infinite entries ({}); remove the frame")
+    bottom = T_world_cam[:, 3]
+    off = np.abs(bottom - [0, 0, 0, 1]).max(axis=1)
+    _refuse(off > 1e-6, where, bottom, "the last row is {}, not 0 0 0 1; give a 4x4 camera-to-world matrix")
+    R = T_world_cam[:, :3, :3]
+    det = np.linalg.det(R)
+    _refuse(det < 0, where, det, "the rotation is mirrored (determinant {}); give right-handed axes")
+    skew = np.abs(R.swapaxes(1, 2) @ R - np.eye(3)).max(axis=(1, 2))
+    _refuse(skew > MAX_SKEW, where, skew, "the 3x3 is no rotation (R^T R is off by {}); correct the pose")
+    U, _, Vt = np.linalg.svd(R)
+    return T_world_cam[:, :3, 3], _canonical(Rotation.from_matrix(U @ Vt))
+
+
+def unit_quats(quats: np.ndarray, where: Sequence[str], scalar_first: bool) -> np.ndarray:
+    """(N, 4) unit quaternions wxyz, w >= 0, of (N, 4) finite quaternions as a file has them.
+
+    Raises:
+        DataError: a norm is more than 10 % off 1, far beyond rounding: those are not quaternions.
+    """
+    norms = np.linalg.norm(quats, axis=1)
+    off = np.abs(norms - 1)
+    _refuse(off > 0.1, where, norms, "the quaternion's norm is {}, not 1; check the order of the columns")
+    return _canonical(Rotation.from_quat(quats, scalar_first=scalar_first))
+
+
+def require_images(paths: Iterable[Path], listed_in: str) -> None:
+    """Raise ImageError, naming the first and the number of them, if listed images are missing."""
+    missing = [path for path in paths if not path.is_file()]
+    if missing:
+        raise ImageError(
+            f"{missing[0]} is missing, listed in {listed_in} ({len(missing)} such images); "
+            "unpack the images there or take them off the list"
+        )
+
+
+def natural_key(text: str) -> list[tuple[int, str]]:
+    """Sort key that puts `seq2` before `seq10`."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", text)]
+
+
+def ordered(frames: Iterable[Frame]) -> tuple[Frame, ...]:
+    """Frames in the order that a Scene wants: sequence by sequence, by index within each."""
+    return tuple(sorted(frames, key=lambda frame: (natural_key(frame.sequence), frame.index)))
+
+
+def _canonical(rotation: Rotation) -> np.ndarray:
+    """w >= 0: q and -q are one rotation, and comparing files must not depend on which one was written."""
+    return rotation.as_quat(canonical=True, scalar_first=True)
+
+
+def _refuse(bad: np.ndarray, where: Sequence[str], values: np.ndarray, complaint: str) -> None:
+    """Raise DataError with the place and the value of the first bad row, if there is one."""
+    for i in np.flatnonzero(bad)[:1]:
+        value = np.array2string(values[i], precision=6).replace("\n", "")
+        raise DataError(f"{where[i]}: {complaint.format(value)}")

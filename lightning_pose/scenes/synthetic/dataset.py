@@ -1,0 +1,169 @@
+"""Writes a synthetic room to disk as a 7-Scenes dataset: the default data of every config."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from lightning_pose.errors import ConfigError, DataError
+from lightning_pose.scenes.synthetic.render import Renderer, pinhole
+from lightning_pose.scenes.synthetic.room import make_room
+from lightning_pose.scenes.synthetic.trajectory import Walk, is_test, make_walks
+
+__all__ = ["METADATA", "MIN_FRAMES", "RENDERER_VERSION", "render_room", "sequence_lengths"]
+
+METADATA = "synthetic.json"
+RENDERER_VERSION = 1
+"""Goes up whenever the same seed gives other images or poses."""
+
+MIN_FRAMES = 6
+SMALLEST, LARGEST = (64, 48), (1920, 1440)
+SHUTTER = 0.25
+"""The part of the time between two frames that the shutter is open for."""
+
+
+def render_room(
+    root: Path,
+    seed: int = 0,
+    frames: int = 300,
+    size: tuple[int, int] = (320, 240),
+    progress: Callable[[int, int], None] | None = None,
+) -> Path:
+    """Render a textured room along hand-held trajectories, in 7-Scenes layout.
+
+    The same arguments give the same bytes. The images are rendered into a hidden sibling folder that is
+    renamed at the end, so `root` is either absent or complete, even if several processes ask for it at
+    once. A `root` that already holds this very room is returned as it is.
+
+    Args:
+        root: folder to write.
+        seed: which room; each has its own dimensions, surfaces, furniture, pictures and trajectories.
+        frames: number of images, over all sequences.
+        size: width and height of the images, in pixels.
+        progress: called with the number of images written and the total, after each.
+
+    Returns:
+        root. It holds `seq-01`, ... with `frame-%06d.color.png` and `frame-%06d.pose.txt` (4x4
+        camera-to-world, OpenCV axes, metres, z up), `TrainSplit.txt`, `TestSplit.txt`, and `synthetic.json`.
+
+    Raises:
+        ConfigError: seed, frames or size is out of range.
+        DataError: root holds something else, or cannot be written.
+    """
+    _check(seed, frames, size)
+    root = Path(root)
+    metadata = {
+        "seed": seed,
+        "frames": frames,
+        "size": list(size),
+        "renderer_version": RENDERER_VERSION,
+        "intrinsics": asdict(pinhole(size)),
+    }
+    if _holds(root, metadata):
+        return root
+    try:
+        root.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{root.name}-", dir=root.parent) as scratch:
+            partial = Path(scratch) / root.name
+            _write_room(partial, seed, frames, size, progress)
+            (partial / METADATA).write_text(json.dumps(metadata, indent=2) + "\n")
+            try:
+                partial.rename(root)
+            except OSError:
+                # Another process may have finished the same room first; then its copy is as good.
+                if not _holds(root, metadata):
+                    raise
+    except OSError as error:
+        raise DataError(f"cannot write the room to {root}: {error}; give a folder that can be written") from error
+    return root
+
+
+def sequence_lengths(frames: int) -> list[int]:
+    """Frames per sequence: about 30 up to 300 frames, then ten longer ones, then more of 100."""
+    count = max(3, min(10, frames // 30), -(-frames // 100))
+    return [len(part) for part in np.array_split(np.arange(frames), count)]
+
+
+def _check(seed: int, frames: int, size: tuple[int, int]) -> None:
+    if seed < 0:
+        raise ConfigError(f"seed is {seed}; give a whole number of 0 or more")
+    if frames < MIN_FRAMES:
+        raise ConfigError(
+            f"frames is {frames}, too few for two training and one test sequence; give {MIN_FRAMES} or more"
+        )
+    if not (SMALLEST[0] <= size[0] <= LARGEST[0] and SMALLEST[1] <= size[1] <= LARGEST[1]):
+        low, high = (f"{w}x{h}" for w, h in (SMALLEST, LARGEST))
+        raise ConfigError(f"size is {size[0]}x{size[1]}; give a width and height from {low} to {high} pixels")
+
+
+def _holds(root: Path, metadata: dict) -> bool:
+    """Whether root holds this very room; False if it is absent or empty.
+
+    Raises:
+        DataError: root holds anything else.
+    """
+    if not root.exists() or (root.is_dir() and not any(root.iterdir())):
+        return False
+    remedy = "give another folder, or delete it first"
+    try:
+        found = json.loads((root / METADATA).read_text())
+    except (OSError, ValueError) as error:
+        raise DataError(f"{root} already holds something that is not a synthetic room; {remedy}") from error
+    if found == metadata:
+        return True
+    other = ", ".join(f"{key} {found.get(key)}" for key in metadata if found.get(key) != metadata[key])
+    raise DataError(f"{root} already holds another synthetic room ({other}); {remedy}")
+
+
+def _write_room(
+    root: Path, seed: int, frames: int, size: tuple[int, int], progress: Callable[[int, int], None] | None
+) -> None:
+    room, lengths = make_room(seed), sequence_lengths(frames)
+    renderer = Renderer(room.quads, pinhole(size), size)
+    walks = make_walks(seed, room.size_m, lengths)
+    root.mkdir()
+    for name, held_out in (("TrainSplit.txt", False), ("TestSplit.txt", True)):
+        lines = [f"sequence{i + 1}\n" for i in range(len(walks)) if is_test(i) == held_out]
+        (root / name).write_text("".join(lines))
+    jobs = []
+    for i, walk in enumerate(walks):
+        folder = root / f"seq-{i + 1:02d}"
+        folder.mkdir()
+        jobs += [(folder, walk, [seed, 2, i], frame) for frame in range(walk.length)]
+    # Threads do: OpenCV and numpy let go of the interpreter's lock, and nothing has to be started or copied.
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
+        for done, _ in enumerate(pool.map(lambda job: _write_frame(renderer, *job), jobs), start=1):
+            if progress is not None:
+                progress(done, frames)
+
+
+def _write_frame(renderer: Renderer, folder: Path, walk: Walk, seed: list[int], frame: int) -> None:
+    moments = frame + SHUTTER * (np.arange(4) - 1.5) / 4
+    image = renderer.render(np.array([walk.pose(moment) for moment in moments]))
+    image = _expose(image, np.random.default_rng([*seed, frame]), np.random.default_rng(seed), frame)
+    stem = folder / f"frame-{frame:06d}"
+    ok, png = cv2.imencode(".png", image)
+    if not ok:
+        raise RuntimeError(f"OpenCV could not encode frame {frame}")
+    Path(f"{stem}.color.png").write_bytes(png.tobytes())
+    np.savetxt(f"{stem}.pose.txt", walk.pose(frame), fmt="%.9f")
+
+
+def _expose(
+    image: np.ndarray, frame_rng: np.random.Generator, sequence_rng: np.random.Generator, frame: int
+) -> np.ndarray:
+    """The sensor: a gain and white balance that drift along the sequence, shot and read noise, 8 bits."""
+    phase, period = sequence_rng.uniform(0, 2 * np.pi, 4), sequence_rng.uniform(40, 120, 4)
+    wave = np.sin(phase + 2 * np.pi * frame / period)
+    image = image * (1 + 0.08 * wave[0] + 0.02 * wave[1:]).astype(np.float32)
+    deviation = np.sqrt(1.0 + 0.02 * image)
+    image += deviation * frame_rng.standard_normal(image.shape, np.float32)
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8)

@@ -1,0 +1,204 @@
+"""The synthetic room: which textured rectangles it is made of, and the light baked into them.
+
+The world's origin is the middle of the floor; x runs along the longer walls, y towards the wall that the
+camera mostly looks at, z up; metres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+
+import cv2
+import numpy as np
+
+from lightning_pose.scenes.synthetic import textures
+from lightning_pose.scenes.synthetic.posters import poster
+
+__all__ = ["TEXELS_PER_M", "Quad", "Room", "make_room"]
+
+TEXELS_PER_M = 256
+Paint = Callable[[np.random.Generator, int, int], np.ndarray]
+RIGHT = {
+    "-y": (1, 0, 0),
+    "+y": (-1, 0, 0),
+    "-x": (0, -1, 0),
+    "+x": (0, 1, 0),
+    "+z": (1, 0, 0),
+    "-z": (1, 0, 0),
+}
+DOWN = {"+z": (0, -1, 0), "-z": (0, 1, 0)}
+"""A surface's texture axes by the axis that it faces; whatever faces sideways hangs upright."""
+
+
+@dataclass(frozen=True)
+class Quad:
+    """A textured rectangle, seen from one side: there u points right and v down.
+
+    Attributes:
+        corner: (3,) world position of the texture's top left corner.
+        u: (3,) edge along the texture's rows.
+        v: (3,) edge along the texture's columns.
+        texture: (H, W, 3) uint8 BGR, light included.
+    """
+
+    corner: np.ndarray
+    u: np.ndarray
+    v: np.ndarray
+    texture: np.ndarray
+
+
+@dataclass(frozen=True)
+class Room:
+    """Everything that can be seen, and (3,) the room's extent along x, y and z."""
+
+    quads: tuple[Quad, ...]
+    size_m: np.ndarray
+
+
+def make_room(seed: int) -> Room:
+    """Furnish the room of one seed: dimensions, surfaces, furniture, pictures and lamps are all its own."""
+    rng = np.random.default_rng([seed, 0])
+    size = rng.uniform((5.4, 3.8, 2.5), (6.6, 4.4, 2.9))
+    boxes = _furniture(rng, size)
+    lamps = np.array([(-size[0] / 4, 0.1, size[2] - 0.15), (size[0] / 4, -0.3, size[2] - 0.15)])
+    lamps += rng.uniform(-0.5, 0.5, (2, 3)) * (1, 1, 0)
+    bare = [*_shell(rng, size), *_pictures(rng, size)]
+    for box in boxes:
+        bare += _box_faces(rng, *box)
+    return Room(tuple(_lit(quad, size, np.array(boxes), lamps) for quad in bare), size)
+
+
+def _face(
+    rng: np.random.Generator, paint: Paint, center: np.ndarray, facing: str, width_m: float, height_m: float
+) -> Quad:
+    """A rectangle of a size around a centre, its visible side facing along a world axis."""
+    u, v = width_m * np.array(RIGHT[facing]), height_m * np.array(DOWN.get(facing, (0, 0, -1)))
+    texture = paint(rng, round(height_m * TEXELS_PER_M), round(width_m * TEXELS_PER_M))
+    return Quad(center - u / 2 - v / 2, u, v, texture)
+
+
+def _shell(rng: np.random.Generator, size: np.ndarray) -> Iterator[Quad]:
+    """Walls, floor, ceiling and a rug."""
+    x, y, z = size
+    main, side = textures.bricks, textures.wallpaper
+    if rng.random() < 0.5:
+        main, side = side, main
+    floor = textures.planks if rng.random() < 0.5 else textures.tiles
+    yield _face(rng, main, np.array([0, y / 2, z / 2]), "-y", x, z)
+    yield _face(rng, main, np.array([0, -y / 2, z / 2]), "+y", x, z)
+    yield _face(rng, side, np.array([x / 2, 0, z / 2]), "-x", y, z)
+    yield _face(rng, side, np.array([-x / 2, 0, z / 2]), "+x", y, z)
+    yield _face(rng, floor, np.array([0, 0, 0]), "+z", x, y)
+    yield _face(rng, textures.panels, np.array([0, 0, z]), "-z", x, y)
+    yield _face(rng, textures.rug, np.array([rng.uniform(-0.5, 0.5), 0.1, 0.006]), "+z", 2.8, 1.6)
+
+
+def _pictures(rng: np.random.Generator, size: np.ndarray) -> Iterator[Quad]:
+    """One or two pictures in each slot of about a metre along every wall."""
+    x, y, z = size
+    for facing, wall, length in (
+        ("-y", np.array([0, y / 2 - 0.01, 0]), x),
+        ("+y", np.array([0, -y / 2 + 0.01, 0]), x),
+        ("-x", np.array([x / 2 - 0.01, 0, 0]), y),
+        ("+x", np.array([-x / 2 + 0.01, 0, 0]), y),
+    ):
+        slots = np.linspace(-length / 2 + 0.1, length / 2 - 0.1, round(length) + 1)
+        for left, right in pairwise(slots):
+            edges = [0.75, z - 0.15] if rng.random() < 0.4 else [0.75, rng.uniform(1.4, 1.7), z - 0.15]
+            for low, high in pairwise(edges):
+                w, h = (right - left) * rng.uniform(0.6, 0.92), (high - low) * rng.uniform(0.6, 0.92)
+                along = (left + right) / 2 + rng.uniform(-0.5, 0.5) * (right - left - w)
+                height = (low + high) / 2 + rng.uniform(-0.5, 0.5) * (high - low - h)
+                center = wall + along * np.array(RIGHT[facing]) + (0, 0, height)
+                yield _face(rng, poster, center, facing, w, h)
+
+
+def _furniture(rng: np.random.Generator, size: np.ndarray) -> list[np.ndarray]:
+    """Boxes, (2, 3) lowest and highest corner: along the far wall, along both side walls, and upon those."""
+    x, y, _ = size
+    standing: list[np.ndarray] = []
+    at = -x / 2 + 0.05
+    while at < x / 2 - 0.9:
+        w, d, h = rng.uniform((0.5, 0.3, 0.4), (1.2, 0.6, 0.95))
+        if rng.random() < 0.25:
+            h = rng.uniform(1.5, 1.95)
+        standing.append(np.array([(at, y / 2 - 0.02 - d, 0), (at + w, y / 2 - 0.02, h)]))
+        at += w + rng.uniform(0.1, 0.7)
+    for side in (-1, 1):
+        at = y / 2 - 0.75
+        while at > -y / 2 + 0.7:
+            w, d, h = rng.uniform((0.4, 0.3, 0.35), (0.9, 0.5, 1.1))
+            wall = side * (x / 2 - 0.02)
+            near, far = sorted((wall, wall - side * d))
+            standing.append(np.array([(near, at - w, 0), (far, at, h)]))
+            at -= w + rng.uniform(0.15, 0.8)
+    upon = []
+    for low, high in standing:
+        if high[2] < 1.2 and rng.random() < 0.75:
+            extent = rng.uniform((0.4, 0.5, 0), (0.7, 0.9, 0)) * (high - low) + (0, 0, rng.uniform(0.15, 0.4))
+            start = rng.uniform(low, high - extent) * (1, 1, 0) + (0, 0, high[2])
+            upon.append(np.array([start, start + extent]))
+    return standing + upon
+
+
+def _box_faces(rng: np.random.Generator, low: np.ndarray, high: np.ndarray) -> Iterator[Quad]:
+    """Four sides of one material, and a top."""
+    middle, (w, d, h) = (low + high) / 2, high - low
+    if low[2] > 0:
+        front: Paint = textures.carton
+    elif h > 1.2:
+        front = textures.bookshelf
+    else:
+        front = textures.drawers if rng.random() < 0.7 else textures.bookshelf
+    for facing, face, width in (("-y", low, w), ("+y", high, w), ("-x", low, d), ("+x", high, d)):
+        axis = "xy".index(facing[1])
+        center = middle.copy()
+        center[axis] = face[axis]
+        yield _face(rng, front, center, facing, width, h)
+    top = textures.carton if low[2] > 0 else textures.planks
+    yield _face(rng, top, np.array([middle[0], middle[1], high[2]]), "+z", w, d)
+
+
+def _lit(quad: Quad, size: np.ndarray, boxes: np.ndarray, lamps: np.ndarray) -> Quad:
+    """The rectangle with its light baked in: lamps behind soft shadows, and darker corners.
+
+    The light is computed on a grid of about 8 points a metre and interpolated.
+    """
+    h, w = quad.texture.shape[:2]
+    rows, columns = (max(4, round(n / TEXELS_PER_M * 8)) for n in (h, w))
+    s, t = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)
+    normal = np.cross(quad.v, quad.u)
+    normal /= np.linalg.norm(normal)
+    points = quad.corner + s[..., None] * quad.u + t[..., None] * quad.v
+    light = 0.45 * _openness(points + 0.1 * normal, size, boxes)
+    softness = 0.25 * np.array([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0)])
+    rays = (lamps[:, None] + softness).reshape(-1, 3) - points[..., None, :]
+    distance = np.linalg.norm(rays, axis=-1)
+    incidence = np.clip((rays @ normal) / distance, 0, 1)
+    reaches = ~_blocked(points[..., None, :] + 0.01 * normal, rays, boxes)
+    light += (0.145 * reaches * incidence / (0.35 + 0.1 * distance**2)).sum(-1)
+    shade = cv2.resize(light.astype(np.float32), (w, h), interpolation=cv2.INTER_LINEAR)
+    return Quad(quad.corner, quad.u, quad.v, textures.shaded(quad.texture, shade))
+
+
+def _openness(points: np.ndarray, size: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+    """In 0..1, smaller near walls and boxes: a stand-in for ambient occlusion."""
+    above = points + size / 2 * (1, 1, 0)
+    openness = np.prod([1 - 0.3 * np.exp(-gap / 0.25) for gap in (above, size - above)], axis=(0, -1))
+    for low, high in boxes:
+        gap = np.linalg.norm(np.maximum(np.maximum(low - points, points - high), 0), axis=-1)
+        openness = openness * (1 - 0.3 * np.exp(-gap / 0.15))
+    return openness
+
+
+def _blocked(points: np.ndarray, rays: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+    """Whether the segment from each point along its ray hits a box (slab test)."""
+    blocked = np.zeros(rays.shape[:-1], bool)
+    inverse = 1 / np.where(np.abs(rays) < 1e-9, 1e-9, rays)
+    for low, high in boxes:
+        first, second = (low - points) * inverse, (high - points) * inverse
+        enters, leaves = np.minimum(first, second).max(-1), np.maximum(first, second).min(-1)
+        blocked |= (enters < leaves) & (leaves > 0) & (enters < 1)
+    return blocked

@@ -1,0 +1,47 @@
+"""TUM trajectory files: `timestamp tx ty tz qx qy qz qw`, one pose a line, as evo and the TUM tools read them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from lightning_pose.scenes.scene import Frame
+
+__all__ = ["write_sequences", "write_tum"]
+
+
+def write_tum(path: Path, timestamps: Sequence[float], position_m: np.ndarray, quat_wxyz: np.ndarray) -> None:
+    """Write M camera-to-world poses.
+
+    Args:
+        path: the file; its folder is made.
+        timestamps: M seconds.
+        position_m: (M, 3).
+        quat_wxyz: (M, 4); the file has the scalar last.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rows = np.column_stack([timestamps, position_m, np.roll(quat_wxyz, -1, axis=1)])
+    np.savetxt(path, rows, fmt="%.6f" + " %.9f" * 7, header="timestamp tx ty tz qx qy qz qw")
+
+
+def write_sequences(folder: Path, frames: Iterable[Frame], position_m: np.ndarray, quat_wxyz: np.ndarray) -> list[Path]:
+    """Write the poses of frames into one file a sequence, `folder/SEQUENCE.tum`, and return the files.
+
+    A frame's number stands in for its time where the dataset has none.
+    """
+    rows: dict[str, list[int]] = {}
+    frames = list(frames)
+    for i, frame in enumerate(frames):
+        rows.setdefault(frame.sequence, []).append(i)
+    files = []
+    for sequence, members in rows.items():
+        times = [_time(frames[i]) for i in members]
+        files.append(folder / f"{sequence.replace('/', '_')}.tum")
+        write_tum(files[-1], times, position_m[members], quat_wxyz[members])
+    return files
+
+
+def _time(frame: Frame) -> float:
+    return float(frame.index) if frame.timestamp is None else frame.timestamp

@@ -1,0 +1,80 @@
+"""The study's own MLflow run, which holds those of its trials."""
+
+from __future__ import annotations
+
+from mlflow import MlflowClient
+from mlflow.exceptions import MlflowException
+from optuna import Study
+from optuna.trial import TrialState
+
+from lightning_pose.runs.logger import MLflowLogger
+from lightning_pose.sweeps.plan import Plan
+from lightning_pose.sweeps.results import SHOWN, best_trials, short, tally
+from lightning_pose.sweeps.trial import RUN
+
+__all__ = ["close_parent", "close_run", "describe_parent", "open_parent"]
+
+
+def open_parent(study: Study, plan: Plan) -> tuple[MlflowClient, str]:
+    """The MLflow run that holds the trials: the study's own, reopened, or a new one.
+
+    Returns:
+        A client, and the run's id.
+    """
+    uri, experiment = plan.tracking
+    logger = plan.resolved["trainer"]["logger"]["init_args"]
+    kept = study.user_attrs.get(RUN)
+    if kept is not None and not _exists(MlflowClient(uri), kept):
+        kept = None  # another MLflow store than last time
+    record = MLflowLogger(experiment, run_name=study.study_name, tracking_uri=uri, run_id=kept, root=logger["root"])
+    client, run = record.client, str(record.run_id)
+    client.update_run(run, status="RUNNING")
+    if kept is None:
+        study.set_user_attr(RUN, run)
+        tags = {
+            "verb": "sweep",
+            "architecture": plan.system,
+            "scene": plan.scene,
+            "sweep.study": study.study_name,
+            "sweep.sampler": plan.sampler["name"],
+            "sweep.objectives": ", ".join(objective.metric for objective in plan.objectives),
+        }
+        for name, value in tags.items():
+            client.set_tag(run, name, value)
+        client.log_artifact(run, str(plan.file))
+        for base in plan.bases.values():
+            client.log_artifact(run, str(base))
+    return client, run
+
+
+def describe_parent(client: MlflowClient, run: str, study: Study, plan: Plan) -> None:
+    """Make a table of the best trials the description of the study's run."""
+    names = [objective.metric for objective in plan.objectives]
+    lines = [f"{tally(study)}\n", f"| trial | {' | '.join(names)} | settings |", f"|---|{'---|' * len(names)}---|"]
+    for trial in best_trials(study, plan)[:SHOWN]:
+        values = " | ".join(short(value) for value in trial.values)
+        # In one column, which wraps: a wide table pushes the rest off MLflow's page.
+        settings = ", ".join(f"{key.partition('.')[2]} {short(value)}" for key, value in trial.params.items())
+        lines.append(f"| {trial.number} | {values} | {settings} |")
+    client.set_tag(run, "mlflow.note.content", "\n".join(lines))
+
+
+def close_parent(client: MlflowClient, run: str, study: Study, status: str) -> None:
+    """End the study's run, unless another command has a trial under way, which ends it then."""
+    if not study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)) and _exists(client, run):
+        client.set_terminated(run, status)
+
+
+def close_run(client: MlflowClient, run: str | None, reason: str) -> None:
+    """Mark the run of a trial whose process is gone; None where it had none yet."""
+    if run is not None and _exists(client, run):
+        client.set_tag(run, "sweep.state", "FAILED")
+        client.set_tag(run, "sweep.reason", reason)
+        client.set_terminated(run, "KILLED")
+
+
+def _exists(client: MlflowClient, run: str) -> bool:
+    try:
+        return client.get_run(run).info.lifecycle_stage == "active"
+    except MlflowException:
+        return False

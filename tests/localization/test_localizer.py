@@ -1,0 +1,73 @@
+"""Localizer: a checkpoint back to a thing that locates images."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from lightning_pose.errors import CheckpointError, ImageError
+from lightning_pose.localization.localizer import Localizer, read_checkpoint
+from lightning_pose.scenes.images import read_gray
+from tests.helpers import Thumbnails, Trained
+
+
+@pytest.fixture
+def localizer(trained: Trained) -> Localizer:
+    return Localizer.from_checkpoint(trained.best)
+
+
+@pytest.fixture
+def images(scene: Path) -> list[Path]:
+    return sorted((scene / "seq-03").glob("*.png"))
+
+
+def test_a_checkpoint_is_plain_and_whole(trained: Trained) -> None:
+    checkpoint = read_checkpoint(trained.best)
+    assert checkpoint["lightning_pose"]["model"]["init_args"]["input_shape"] == [6, 8]
+    assert checkpoint["lightning_pose"]["data"]["init_args"]["root"] == str(trained.workplace.scene)
+
+
+def test_it_locates_as_the_test_did(localizer: Localizer, images: list[Path], trained: Trained) -> None:
+    position_m, quat_wxyz = localizer(images)
+    kept = trained.workplace.client.download_artifacts(trained.run.info.run_id, "trajectories/predictions/seq-03.tum")
+    rows = np.loadtxt(kept)
+    np.testing.assert_allclose(position_m, rows[:, 1:4], atol=1e-5)
+    np.testing.assert_allclose(quat_wxyz, rows[:, [7, 4, 5, 6]], atol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(quat_wxyz, axis=1), 1, atol=1e-6)
+
+
+def test_files_names_and_arrays_are_one(localizer: Localizer, images: list[Path]) -> None:
+    from_files = localizer(images[:2])
+    from_mixed = localizer([str(images[0]), read_gray(images[1])])
+    for a, b in zip(from_files, from_mixed, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_it_does_not_learn(localizer: Localizer, images: list[Path]) -> None:
+    assert isinstance(localizer.extractor, Thumbnails)
+    assert not localizer.model.training
+    np.testing.assert_array_equal(localizer(images[:1])[0], localizer(images[:1])[0])
+
+
+def test_an_image_that_is_missing(localizer: Localizer) -> None:
+    with pytest.raises(ImageError, match=r"nowhere.png does not exist; check"):
+        localizer(["nowhere.png"])
+
+
+@pytest.mark.parametrize("content", [b"", b"garbage", b"PK\x03\x04 a broken archive"])
+def test_a_file_that_is_no_checkpoint(content: bytes, tmp_path: Path) -> None:
+    file = tmp_path / "some.ckpt"
+    file.write_bytes(content)
+    with pytest.raises(CheckpointError, match=f"{file} cannot be read as a checkpoint; it is damaged"):
+        read_checkpoint(file)
+
+
+def test_a_checkpoint_without_data(trained: Trained, tmp_path: Path) -> None:
+    checkpoint = torch.load(trained.best, weights_only=True)
+    checkpoint["lightning_pose"]["data"] = None
+    torch.save(checkpoint, tmp_path / "model.ckpt")
+    with pytest.raises(CheckpointError, match=r"model.ckpt does not say which features it reads; train with"):
+        Localizer.from_checkpoint(tmp_path / "model.ckpt")

@@ -1,0 +1,109 @@
+"""TUM RGB-D: association by time, and xyzw."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lightning_pose.errors import DataError, ImageError
+from lightning_pose.scenes.formats import load_scene
+from lightning_pose.scenes.formats.tum import associate
+from lightning_pose.scenes.scene import Intrinsics
+from tests.data.helpers import REAL_DATA, make_image
+
+OFFICE = REAL_DATA / "tum" / "hololens_office"
+
+
+def write(root: Path, image_times: list[float], rows: list[str]) -> Path:
+    paths = [f"rgb/{time:.6f}.png" for time in image_times]
+    for path in paths:
+        make_image(root / path)
+    lines = [f"{time:.6f} {path}\n" for time, path in zip(image_times, paths, strict=True)]
+    (root / "rgb.txt").write_text("# color images\n# timestamp filename\n" + "".join(lines))
+    (root / "groundtruth.txt").write_text("# timestamp tx ty tz qx qy qz qw\n" + "\n".join(rows) + "\n")
+    return root
+
+
+def test_pose_and_order_of_the_quaternion(tmp_path: Path) -> None:
+    root = tmp_path / "rgbd_dataset_freiburg1_desk"
+    rows = ["100.1 4 5 6 0 0 0 1", "100.004 1 2 3 0.1 0.1 0.7 0.7", "100.2 0 0 0 0 0 0 -1"]
+    scene = load_scene(write(root, [100.1, 100.0, 100.2], rows))
+    frame = scene.frames[0]
+    np.testing.assert_allclose(frame.position_m, [1, 2, 3])
+    np.testing.assert_allclose(frame.quat_wxyz, [0.7, 0.7 / 7, 0.7 / 7, 0.7])
+    assert (frame.sequence, frame.index, frame.timestamp) == (root.name, 0, 100.0)
+    assert frame.intrinsics == Intrinsics(517.3, 516.5, 318.6, 255.3)
+    np.testing.assert_allclose([f.quat_wxyz[0] for f in scene.frames[1:]], 1)
+    assert (scene.name, scene.format) == (root.name, "tum")
+
+
+def test_association_is_one_to_one_closest_first() -> None:
+    """Image 0 and 1 both want pose 0; image 1 is closer, and image 0 then finds nothing within 20 ms."""
+    pairs = associate(np.array([0.0, 0.015, 1.0, 2.0]), np.array([0.014, 0.990, 1.005, 2.021]))
+    np.testing.assert_array_equal(pairs, [[1, 0], [2, 2]])
+
+
+def test_second_choice_is_taken_when_the_first_is_gone() -> None:
+    pairs = associate(np.array([0.000, 0.010]), np.array([0.008, -0.015]))
+    np.testing.assert_array_equal(pairs, [[0, 1], [1, 0]])
+
+
+@pytest.mark.parametrize(("offset", "count"), [(0.0199, 1), (-0.0199, 1), (0.0201, 0), (-0.0201, 0)])
+def test_association_reaches_20_ms(offset: float, count: int) -> None:
+    assert len(associate(np.array([5.0]), np.array([5.0 + offset]))) == count
+
+
+def test_images_without_a_pose_are_dropped_with_a_count(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    rows = [f"{t} {t} 0 0 0 0 0 1" for t in (0.5, 1.5, 2.5, 3.5)]
+    with caplog.at_level(logging.WARNING, "lightning_pose"):
+        scene = load_scene(write(tmp_path, [0.5, 1.0, 1.5, 2.5, 3.5], rows))
+    assert "dropped 1 of 5 images, no pose within 20 ms" in caplog.text
+    assert [f.index for f in scene.frames] == [0, 2, 3, 4]
+
+
+def test_clocks_that_never_meet_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"none of the 2 images .* 1\.000 to 2\.000 s, .* 901\.500 .*one clock"):
+        load_scene(write(tmp_path, [1, 2], ["901.5 0 0 0 0 0 0 1"]))
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ("0.5 1 2 3 0 0 0", r"groundtruth.txt:2: expected finite numbers `timestamp tx .*`, found `0.5 1"),
+        ("0.5 1 2 nan 0 0 0 1", r"groundtruth.txt:2: expected finite numbers"),
+        ("0.5 0 0 0 1 3 2 1", r"groundtruth.txt:2: the quaternion's norm is 3\.87.*check the order"),
+    ],
+)
+def test_bad_row_is_refused(tmp_path: Path, row: str, message: str) -> None:
+    with pytest.raises(DataError, match=message):
+        load_scene(write(tmp_path, [0.5], [row]))
+
+
+def test_bad_image_list_is_refused(tmp_path: Path) -> None:
+    write(tmp_path, [0.5], ["0.5 0 0 0 0 0 0 1"])
+    (tmp_path / "rgb.txt").write_text("rgb/0.5.png\n")
+    with pytest.raises(DataError, match=r"rgb.txt:1: expected `timestamp path`"):
+        load_scene(tmp_path)
+    (tmp_path / "rgb.txt").write_text("# nothing\n")
+    with pytest.raises(DataError, match=r"rgb.txt lists no image"):
+        load_scene(tmp_path)
+
+
+def test_missing_image_is_named(tmp_path: Path) -> None:
+    write(tmp_path, [0.5], ["0.5 0 0 0 0 0 0 1"])
+    (tmp_path / "rgb" / "0.500000.png").unlink()
+    with pytest.raises(ImageError, match=r"0.500000.png is missing, listed in rgb.txt .*; unpack"):
+        load_scene(tmp_path)
+
+
+@pytest.mark.real_data
+@pytest.mark.skipif(not OFFICE.is_dir(), reason="hololens_office is not beside the checkout")
+def test_hololens_office() -> None:
+    scene = load_scene(OFFICE)
+    sizes = {split: len(indices) for split, indices in scene.splits.items()}
+    assert sizes == {"train": 268, "val": 30, "test": 75}
+    np.testing.assert_allclose(scene.frames[0].position_m, [-1.943120, 0.112344, 4.679990])
+    np.testing.assert_allclose(scene.frames[0].quat_wxyz, [0.150952, 0.793430, -0.122476, 0.576786], atol=1e-5)

@@ -1,0 +1,299 @@
+"""What a sweep bears: Ctrl-C at any moment, processes that die or break, and an MLflow that fails."""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+import socket
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NoReturn
+
+import optuna
+import pytest
+import yaml
+from mlflow import MlflowClient
+from mlflow.exceptions import MlflowException
+from optuna.exceptions import StorageInternalError
+from optuna.trial import FrozenTrial, TrialState
+
+from lightning_pose.runs.logger import machine, process_name
+from lightning_pose.sweeps import trial, workers
+from lightning_pose.sweeps.outages import PatientStorage
+from lightning_pose.sweeps.plan import Plan, read_plan
+from lightning_pose.sweeps.study import open_storage, open_study, queue_again, recover
+from lightning_pose.sweeps.trial import EpochWatch, run_trial
+from tests.helpers import Workplace
+
+STUDY = "units-wall"
+BOTH = ["val/position_median_m", "val/orientation_median_deg"]
+
+
+def write(workplace: Workplace, **entries: Any) -> Path:
+    """A sweep of the workplace's config."""
+    file = workplace.folder / "units.yaml"
+    space = {"model.units": {"type": "int", "low": 4, "high": 40}}
+    file.write_text(yaml.safe_dump({"base": "tiny.yaml", "pruner": "none", "space": space} | entries))
+    return file
+
+
+def address(workplace: Workplace) -> str:
+    return f"sqlite:///{workplace.folder / 'mlruns' / 'optuna.db'}"
+
+
+@pytest.fixture
+def storage(workplace: Workplace) -> PatientStorage:
+    return open_storage(address(workplace), workplace.uri)
+
+
+@pytest.fixture
+def study(storage: PatientStorage) -> optuna.Study:
+    return optuna.create_study(storage=storage)
+
+
+def states(study: optuna.Study) -> list[str]:
+    return [trial.state.name for trial in study.get_trials(deepcopy=False)]
+
+
+def finish(orders: Any, file: Path) -> None:
+    """A worker whose trial takes a second longer than there are orders."""
+    with pytest.raises(EOFError):
+        orders.recv()
+    time.sleep(1)
+    file.touch()
+
+
+def test_trials_under_way_are_finished_when_a_worker_breaks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "finished"
+
+    def break_off(*args: Any) -> NoReturn:
+        *_, crew = args
+        context = multiprocessing.get_context("spawn")
+        ours, theirs = context.Pipe()
+        process = context.Process(target=finish, args=(theirs, file))
+        process.start()
+        theirs.close()
+        crew.append(workers._Worker(process, ours, busy=True))
+        raise RuntimeError("a worker of the sweep broke")
+
+    monkeypatch.setattr(workers, "PATIENCE_SECONDS", 0)
+    monkeypatch.setattr(workers, "_give_orders", break_off)
+    with pytest.raises(RuntimeError, match="a worker of the sweep broke"):
+        workers.run_together(None, 2, lambda: None, 2)  # type: ignore[arg-type]
+    assert file.exists()
+
+
+def dead_process() -> str:
+    """The name of a process of this machine that is gone."""
+    with subprocess.Popen(["true"]) as process:
+        process.wait()
+    return f"{machine()}:{process.pid}"
+
+
+def last(study: optuna.Study) -> FrozenTrial:
+    return study.get_trials()[-1]
+
+
+def test_a_trial_may_be_interrupted_more_often_than_its_process_may_die(
+    workplace: Workplace, study: optuna.Study, storage: PatientStorage
+) -> None:
+    study.enqueue_trial({"x": 0.5})
+    for _ in range(5):
+        number = study.ask().number
+        study.tell(number, state=TrialState.FAIL)
+        assert queue_again(study, study.trials[number], died=False) == number + 1
+    for again in (True, True, True, False):
+        study.ask().set_user_attr("process", dead_process())
+        dead = last(study).number
+        assert recover(study, storage, workplace.client) == ({dead} if again else set())
+        assert study.trials[dead].state == TrialState.FAIL
+    assert states(study) == ["FAIL"] * 9
+    assert last(study).system_attrs["fixed_params"] == {"x": 0.5}
+
+
+@pytest.mark.parametrize("host", [f"{socket.gethostname()} 01234567", socket.gethostname()])
+def test_trials_of_another_machine_of_the_same_name_are_left_alone(
+    host: str, workplace: Workplace, study: optuna.Study, storage: PatientStorage
+) -> None:
+    study.ask().set_user_attr("process", dead_process().replace(machine(), host))
+    study.ask().set_user_attr("process", process_name())
+    assert recover(study, storage, workplace.client) == set()
+    assert states(study) == ["RUNNING"] * 2
+
+
+@pytest.fixture
+def job(workplace: Workplace, storage: PatientStorage, monkeypatch: pytest.MonkeyPatch) -> workers.Job:
+    """A study with a run in MLflow."""
+    monkeypatch.chdir(workplace.folder)
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", workplace.uri)
+    plan = read_plan(write(workplace, objective=BOTH), {})
+    open_study(plan, STUDY, storage)
+    experiment = workplace.client.create_experiment("lightning_pose")
+    return workers.Job(plan, STUDY, address(workplace), workplace.client.create_run(experiment).info.run_id)
+
+
+@pytest.fixture
+def _ctrl_c() -> Iterator[None]:
+    """Whoever runs the tests in the background has them ignore Ctrl-C."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("_ctrl_c")
+def test_a_second_ctrl_c_does_not_lose_the_trial_of_the_first(
+    job: workers.Job, study: optuna.Study, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def press(*args: Any, **kwargs: Any) -> None:
+        signal.raise_signal(signal.SIGINT)
+
+    def press_and_queue(*args: Any, **kwargs: Any) -> int | None:
+        press()
+        return queue_again(*args, **kwargs)
+
+    monkeypatch.setattr(workers, "run_trial", press)
+    monkeypatch.setattr(workers, "queue_again", press_and_queue)
+    with pytest.raises(KeyboardInterrupt):
+        workers.run_alone(job, 2, lambda: None)
+    assert states(job.open(job.connect())) == ["FAIL", "WAITING"]
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError, AssertionError])
+def test_a_failed_trial_is_none_of_the_next_one_s_business(
+    error: type[BaseException], job: workers.Job, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ctrl-C, or a sampler's mistake, while Optuna chooses the next trial's values."""
+
+    def fail(*args: object) -> NoReturn:
+        raise error
+
+    storage = job.connect()
+    study = job.open(storage)
+    monkeypatch.setattr(workers, "run_trial", lambda *args: 1 / 0)
+    assert workers._run_one(study, storage, job)
+    monkeypatch.setattr(study.sampler, "before_trial", fail)
+    with pytest.raises(error):
+        workers._run_one(study, storage, job)
+    assert states(study) == ["FAIL", "RUNNING"]
+
+
+def test_a_ctrl_c_in_a_trial_that_was_taken_for_dead_ends_the_sweep(
+    job: workers.Job, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    storage = job.connect()
+    study = job.open(storage)
+
+    def press(trial: optuna.Trial, *args: object) -> NoReturn:
+        storage.set_trial_state_values(trial._trial_id, TrialState.FAIL)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(workers, "run_trial", press)
+    with pytest.raises(KeyboardInterrupt):
+        workers._run_one(study, storage, job)
+    assert states(study) == ["FAIL"], "whoever took it for dead has queued it again"
+
+
+def test_ctrl_c_in_the_middle_of_two_workers_trials(workplace: Workplace, capsys: pytest.CaptureFixture[str]) -> None:
+    """Each is queued again, and the next command runs it to its end."""
+    waiter = {"class_path": "tests.helpers.WaitAt", "init_args": {"folder": str(workplace.folder)}}
+    file = write(workplace, sampler="grid", space={"model.units": [4, 5]}, settings={"trainer.callbacks": [waiter]})
+    with workplace.start("sweep", file, "--workers", "2") as first:
+        deadline = time.monotonic() + 200
+        while len(list(workplace.folder.glob("waits-*"))) < 2:
+            assert first.poll() is None, first.communicate()[1]
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        first.send_signal(signal.SIGINT)  # to the command alone, which passes it on
+        _, told = first.communicate(timeout=200)
+    assert first.returncode == 130, told
+    assert "interrupted; the same command goes on" in told
+    assert "Traceback" not in told
+    study = optuna.load_study(study_name=STUDY, storage=address(workplace))
+    assert states(study) == ["FAIL", "FAIL", "WAITING", "WAITING"]
+    assert {trial.user_attrs["reason"] for trial in study.trials[:2]} == {"interrupted"}
+
+    (workplace.folder / "go").touch()
+    assert workplace.command("sweep", file) == 0
+    assert "trial 2/2" in capsys.readouterr().err
+    assert states(study) == ["FAIL", "FAIL", "COMPLETE", "COMPLETE"]
+    assert sorted(trial.params["model.units"] for trial in study.trials[2:]) == [4, 5]
+    runs = workplace.runs()
+    assert sorted(run.info.status for run in runs) == ["FINISHED"] * 3 + ["KILLED"] * 2
+    assert sorted(run.data.tags.get("sweep.state", "study") for run in runs) == [
+        *["COMPLETE"] * 2, *["INTERRUPTED"] * 2, "study",
+    ]  # fmt: skip
+
+
+class Fitted:
+    """What training leaves: the epochs that it was told."""
+
+    curves: dict[str, dict[int, float]] = {}  # noqa: RUF012
+    epochs: list[dict[str, float]] = [{"val/loss": 1.0} | dict.fromkeys(BOTH, 0.5)]  # noqa: RUF012
+
+    def __init__(self, args: list[str], watch: EpochWatch, plan: Plan) -> None:
+        watch.epochs = self.epochs
+        self.measured: dict[str, float] = {}
+
+
+def run_one(job: workers.Job) -> FrozenTrial:
+    storage = job.connect()
+    study = job.open(storage)
+    assert workers._run_one(study, storage, job)
+    return last(study)
+
+
+def test_a_study_whose_run_is_deleted_goes_on(
+    job: workers.Job, workplace: Workplace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(trial, "_TrialCLI", Fitted)
+    workplace.client.delete_run(job.parent)
+    assert run_one(job).state == TrialState.COMPLETE
+
+
+def test_a_number_that_is_none_has_a_reason(
+    job: workers.Job, workplace: Workplace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(trial, "_TrialCLI", Fitted)
+    monkeypatch.setattr(Fitted, "epochs", [{"val/loss": 1.0, BOTH[0]: 0.5, BOTH[1]: float("nan")}])
+    ended = run_one(job)
+    assert ended.state == TrialState.FAIL
+    assert ended.user_attrs["reason"].startswith("val/orientation_median_deg came out as nan; lower the learning rate")
+    run = workplace.client.get_run(ended.user_attrs["mlflow_run"])
+    assert (run.info.status, run.data.tags["sweep.state"]) == ("FAILED", "FAILED")
+
+
+def test_a_trial_without_a_run_has_a_reason(job: workers.Job, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*args: Any, **kwargs: Any) -> NoReturn:
+        raise MlflowException("the server is full")
+
+    monkeypatch.setattr(MlflowClient, "create_run", fail)
+    ended = run_one(job)
+    assert (ended.state, ended.user_attrs["reason"]) == (TrialState.FAIL, "MlflowException: the server is full")
+
+
+@pytest.mark.parametrize("gone", ["mlflow", "optuna"])
+def test_a_store_that_fails_hides_no_ctrl_c(gone: str, job: workers.Job, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*args: Any, **kwargs: Any) -> NoReturn:
+        raise MlflowException("out of reach") if gone == "mlflow" else StorageInternalError
+
+    def press(*args: Any) -> NoReturn:
+        monkeypatch.setattr(*((MlflowClient, "set_tag") if gone == "mlflow" else (optuna.Trial, "set_user_attr")), fail)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(trial, "_TrialCLI", press)
+    study = job.open(job.connect())
+    with pytest.raises(KeyboardInterrupt):
+        run_trial(study.ask(), job.plan, job.parent)
+
+
+def test_a_trial_that_breaks_leaves_no_checkpoint(workplace: Workplace) -> None:
+    breaker = {"class_path": "tests.helpers.FailAt", "init_args": {"epoch": 1}}
+    settings = {"trainer.callbacks": [breaker]}
+    file = write(workplace, measure="test", sampler="grid", space={"model.units": [4]}, settings=settings)
+    assert workplace.command("sweep", file) == 2
+    (ended,) = optuna.load_study(study_name=STUDY, storage=address(workplace)).trials
+    assert ended.user_attrs["reason"] == "RuntimeError: a mistake in the program"
+    assert list((workplace.folder / "mlruns" / "checkpoints").rglob("*")) == []
