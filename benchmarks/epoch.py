@@ -22,9 +22,10 @@ from lightning_pose import models
 from lightning_pose.data.batches import PoseBatch, PoseDataset, batch_loader
 from lightning_pose.features import SURF
 from lightning_pose.geometry.quaternions import align_hemisphere, quat_normalize
+from lightning_pose.runs.checkpoints import BestCheckpoint, LastCheckpoint
 from lightning_pose.runs.epoch_bar import EpochBar
 from lightning_pose.runs.logger import MLflowLogger
-from lightning_pose.runs.recorder import BestCheckpoint, LastCheckpoint, RunRecorder
+from lightning_pose.runs.recorder import RunRecorder
 from lightning_pose.scenes.scene import Scene
 
 

@@ -6,11 +6,23 @@ import inspect
 import sys
 from collections.abc import Mapping
 from importlib import import_module
+from pathlib import Path
 from typing import Any
+
+import torch
 
 from lightning_pose.errors import CheckpointError
 
-__all__ = ["RENAMED_CLASSES", "Spec", "build", "class_path", "describe", "resolve_class_path", "resolve_class_paths"]
+__all__ = [
+    "RENAMED_CLASSES",
+    "Spec",
+    "build",
+    "class_path",
+    "describe",
+    "read_checkpoint",
+    "resolve_class_path",
+    "resolve_class_paths",
+]
 
 Spec = dict[str, Any]
 """`{"class_path": "package.module.Class", "init_args": {...}}`, plain types only."""
@@ -102,3 +114,23 @@ def build(spec: Mapping[str, Any]) -> Any:
         raise CheckpointError(
             f"{path} does not take the saved settings ({error}); it was saved by another version, train it again"
         ) from error
+
+
+def read_checkpoint(path: str | Path) -> dict[str, Any]:
+    """A checkpoint's content, tensors memory-mapped on the CPU, classes by today's paths.
+
+    Raises:
+        CheckpointError: the file is missing, unreadable, or was not written by this project.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise CheckpointError(f"{path} is no file; give a checkpoint such as mlruns/checkpoints/RUN_ID/best.ckpt")
+    try:
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    except Exception as error:  # torch raises half a dozen kinds for a file that is no checkpoint
+        raise CheckpointError(
+            f"{path} cannot be read as a checkpoint; it is damaged or another kind of file"
+        ) from error
+    if not isinstance(checkpoint, dict) or "lightning_pose" not in checkpoint:
+        raise CheckpointError(f"{path} was not written by lightning_pose; give a checkpoint that `fit` wrote")
+    return checkpoint | {"lightning_pose": resolve_class_paths(checkpoint["lightning_pose"])}

@@ -18,14 +18,16 @@ from lightning.pytorch.callbacks import Timer
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
+from lightning_pose.checkpoint import read_checkpoint
 from lightning_pose.errors import CheckpointError, ConfigError
-from lightning_pose.evaluation import TestReport
-from lightning_pose.localization.localizer import read_checkpoint
+from lightning_pose.evaluation.callback import TestReport
 from lightning_pose.localization.sequences import chain_test
 from lightning_pose.models import ClipModule, PoseModule
+from lightning_pose.paths import default_tracking_uri
+from lightning_pose.runs.checkpoints import BestCheckpoint, LastCheckpoint, checkpoint_folder
 from lightning_pose.runs.epoch_bar import EpochBar
-from lightning_pose.runs.logger import default_tracking_uri, last_run
-from lightning_pose.runs.recorder import BestCheckpoint, LastCheckpoint, RunRecorder, checkpoint_folder
+from lightning_pose.runs.logger import last_run
+from lightning_pose.runs.recorder import RunRecorder
 from lightning_pose.scenes.trajectory_files import write_sequences
 
 __all__ = ["PoseCLI", "main"]

@@ -7,10 +7,18 @@ from pathlib import Path
 
 from platformdirs import user_cache_path
 
-__all__ = ["cache_folder"]
+__all__ = ["STORE_VARIABLE", "cache_folder", "default_tracking_uri"]
 
 
 def cache_folder(name: str) -> Path:
     """`name` in `$LIGHTNING_POSE_CACHE`, or else in the user's cache folder (`~/.cache/lightning_pose`)."""
     base = os.environ.get("LIGHTNING_POSE_CACHE")
     return (Path(base).expanduser() if base else user_cache_path("lightning_pose", appauthor=False)) / name
+
+
+STORE_VARIABLE = "MLFLOW_TRACKING_URI"
+
+
+def default_tracking_uri(root: str | Path = "mlruns") -> str:
+    """`MLFLOW_TRACKING_URI`, or a database under `root`."""
+    return os.environ.get(STORE_VARIABLE) or f"sqlite:///{Path(root) / 'mlflow.db'}"

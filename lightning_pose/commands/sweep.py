@@ -158,9 +158,10 @@ def _best_so_far(study: Study, plan: Plan) -> str:
 
 def _conclude(study: Study, plan: Plan, client: MlflowClient, parent: str, folder: Path) -> None:
     """Print the best trials, and keep their config and figures in a folder and in the study's run."""
+    from lightning_pose.runs.tags import REASON
+    from lightning_pose.studies.result import show_study
     from lightning_pose.sweeps.parent_run import describe_parent
-    from lightning_pose.sweeps.results import best_trial, draw_figures, sheet, show_study, tally, write_best
-    from lightning_pose.sweeps.trial import REASON
+    from lightning_pose.sweeps.results import best_trial, draw_figures, sheet, tally, write_best
 
     best = best_trial(study, plan)
     if best is None:

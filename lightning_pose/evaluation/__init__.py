@@ -1,6 +1,1 @@
-"""What every test ends with: `report` for all of it, `images` and `clips` for what is judged of each kind of model."""
-
-from lightning_pose.evaluation.callback import TestReport
-from lightning_pose.evaluation.table import print_results
-
-__all__ = ["TestReport", "print_results"]
+"""What every test ends with: `callback` runs it all, `images` and `clips` measure each kind of model."""

@@ -16,15 +16,13 @@ from lightning_pose.evaluation.result import Evaluation
 from lightning_pose.evaluation.table import print_results, results_markdown
 from lightning_pose.models.base import Pose, PoseModule
 from lightning_pose.models.clip import ClipModule
+from lightning_pose.runs.checkpoints import checkpoint_folder, run_logger
 from lightning_pose.runs.logger import MLflowLogger, log_localizer
-from lightning_pose.runs.recorder import checkpoint_folder, run_logger
+from lightning_pose.runs.tags import NOTE
 from lightning_pose.scenes.scene import Frame
 from lightning_pose.scenes.trajectory_files import write_sequences
 
-__all__ = ["NOTE", "TestReport", "describe_run"]
-
-NOTE = "mlflow.note.content"
-"""The tag that MLflow shows as a run's description, in Markdown."""
+__all__ = ["TestReport", "describe_run"]
 
 
 class TestReport(Callback):

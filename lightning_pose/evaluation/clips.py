@@ -13,7 +13,9 @@ from torch import Tensor
 from lightning_pose.data.clip_dataset import ClipDataset
 from lightning_pose.evaluation.baselines.clips import constant_velocity, no_motion
 from lightning_pose.evaluation.baselines.visual_odometry import visual_odometry
-from lightning_pose.evaluation.result import Evaluation, costs, skill
+from lightning_pose.evaluation.costs import costs
+from lightning_pose.evaluation.responses import layer_responses
+from lightning_pose.evaluation.result import Evaluation, skill
 from lightning_pose.figures import clips as clip_figures
 from lightning_pose.geometry.quaternions import orientation_error_deg, position_error_m, quat_rotate
 from lightning_pose.geometry.relative import absolute_poses, relative_poses
@@ -21,7 +23,7 @@ from lightning_pose.localization.sequences import chain_test
 from lightning_pose.metrics.summary import summarize_errors
 from lightning_pose.metrics.trajectory import drift_by_length, mean_over_sequences, trajectory_errors
 from lightning_pose.models.base import Pose
-from lightning_pose.models.clip import ClipModule, layer_responses
+from lightning_pose.models.clip import ClipModule
 from lightning_pose.scenes.scene import Frame
 
 __all__ = ["LENGTHS", "evaluate_clips"]

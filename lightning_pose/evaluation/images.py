@@ -11,7 +11,8 @@ from matplotlib.figure import Figure
 
 from lightning_pose.data.batches import PoseBatch
 from lightning_pose.evaluation.baselines.images import BaselineResult, evaluate_baselines
-from lightning_pose.evaluation.result import Evaluation, costs, skill
+from lightning_pose.evaluation.costs import costs
+from lightning_pose.evaluation.result import Evaluation, skill
 from lightning_pose.figures import images as image_figures
 from lightning_pose.geometry.quaternions import orientation_error_deg, position_error_m
 from lightning_pose.models.base import Pose, PoseModule

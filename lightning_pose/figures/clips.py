@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, MaxNLocator, MultipleLocator
 from numpy.typing import ArrayLike
 
-from lightning_pose.figures.images import (
+from lightning_pose.figures.style import (
     BASELINES,
     MODEL,
     OTHERS,

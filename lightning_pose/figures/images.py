@@ -8,54 +8,30 @@ apart by the colour-blind) and dash.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import matplotlib
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, MultipleLocator, NullLocator, PercentFormatter
+from matplotlib.ticker import MaxNLocator, MultipleLocator, PercentFormatter
 from numpy.typing import ArrayLike
 
-__all__ = ["Errors", "cumulative_errors", "error_vs_distance", "trajectory"]
+from lightning_pose.figures.style import (
+    BASELINES,
+    MODEL,
+    OTHERS,
+    SMALLEST,
+    STYLE,
+    TRAINING,
+    TRUTH,
+    Errors,
+    _infinite,
+    _log_limits,
+    log_axis,
+    longest_axes,
+)
 
-Errors = tuple[ArrayLike, ArrayLike]
-"""Position errors (N,) in the scene's unit, and orientation errors (N,) in degrees."""
-
-MODEL, TRUTH, TRAINING = "#0072B2", "#1a1a1a", "#c4c4c4"
-BASELINES = {
-    "train_mean": ("#8c8c8c", (0, (1, 1.5))),
-    "retrieval_top1": ("#D55E00", (0, (5, 1.5))),
-    "retrieval_top5": ("#E69F00", (0, (3, 1.5))),
-    "oracle": ("#009E73", (0, (5, 1.5, 1, 1.5))),
-}
-OTHERS = [("#CC79A7", (0, (5, 1.5))), ("#56B4E9", (0, (3, 1.5))), ("#882255", (0, (1, 1)))]
-
-SMALLEST = 1e-4  # a tenth of a millimetre, or its like in degrees: zero has no place on a logarithmic axis
-
-STYLE: dict[Any, Any] = {
-    "font.family": "DejaVu Sans",
-    "font.size": 10,
-    "axes.titlesize": 12,
-    "axes.titlelocation": "left",
-    "axes.titleweight": "bold",
-    "axes.titlepad": 10,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.edgecolor": "#555555",
-    "axes.labelcolor": "#333333",
-    "axes.axisbelow": True,
-    "axes.grid": True,
-    "grid.color": "#e6e6e6",
-    "grid.linewidth": 0.8,
-    "xtick.color": "#555555",
-    "ytick.color": "#555555",
-    "legend.frameon": False,
-    "legend.fontsize": 9,
-    "figure.facecolor": "white",
-    "axes.facecolor": "white",
-}
+__all__ = ["cumulative_errors", "error_vs_distance", "trajectory"]
 
 
 @matplotlib.rc_context(STYLE)
@@ -204,11 +180,6 @@ def error_vs_distance(
     return figure
 
 
-def longest_axes(truth_m: np.ndarray) -> list[int]:
-    """The two axes, in order, along which positions (N, 3) extend furthest."""
-    return sorted(int(axis) for axis in np.argsort(-np.ptp(truth_m, axis=0), kind="stable")[:2])
-
-
 def _view(truth: np.ndarray, prediction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(2,) lower and upper limits that hold all truth and the middle 96 % of predictions, with a margin."""
     drawn = prediction[np.isfinite(prediction).all(axis=1)]
@@ -217,28 +188,6 @@ def _view(truth: np.ndarray, prediction: np.ndarray) -> tuple[np.ndarray, np.nda
     low, high = held.min(axis=0), held.max(axis=0)
     margin = 0.05 * max((high - low).max(), SMALLEST)
     return low - margin, high + margin
-
-
-def _infinite(errors: ArrayLike) -> np.ndarray:
-    values = np.asarray(errors, float)
-    return np.where(np.isnan(values), np.inf, values)
-
-
-def _log_limits(errors: np.ndarray) -> tuple[float, float]:
-    """Limits that hold all finite errors but the smallest hundredth, which would stretch a logarithmic axis."""
-    finite = np.maximum(errors[np.isfinite(errors)], SMALLEST)
-    if not len(finite):
-        return 0.01, 1.0
-    return float(np.quantile(finite, 0.01)) * 0.9, float(finite.max()) * 1.1
-
-
-def log_axis(axes: Axes, which: str, limits: tuple[float, float]) -> None:
-    """Make the axis `x` or `y` logarithmic between limits, with plain numbers at 1, 2, 5 or at powers of ten."""
-    axes.set(**{f"{which}scale": "log", f"{which}lim": limits})
-    axis = axes.xaxis if which == "x" else axes.yaxis
-    axis.set_major_locator(LogLocator(subs=(1, 2, 5) if limits[1] < 1000 * limits[0] else (1,)))
-    axis.set_minor_locator(NullLocator())
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
 
 def _binned_median(x: np.ndarray, y: np.ndarray, n_bins: int = 10) -> tuple[np.ndarray, np.ndarray]:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import torch
 
-from lightning_pose.checkpoint import build, resolve_class_paths
+from lightning_pose.checkpoint import build, read_checkpoint
 from lightning_pose.errors import CheckpointError
 from lightning_pose.features.base import FeatureExtractor
 from lightning_pose.geometry.relative import RelativeFrame
@@ -18,27 +18,7 @@ from lightning_pose.localization.sequences import locate_sequence
 if TYPE_CHECKING:
     from lightning_pose.models import ClipModule, PoseModule
 
-__all__ = ["Localizer", "read_checkpoint"]
-
-
-def read_checkpoint(path: str | Path) -> dict[str, Any]:
-    """A checkpoint's content, tensors memory-mapped on the CPU, classes by today's paths.
-
-    Raises:
-        CheckpointError: the file is missing, unreadable, or was not written by this project.
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise CheckpointError(f"{path} is no file; give a checkpoint such as mlruns/checkpoints/RUN_ID/best.ckpt")
-    try:
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except Exception as error:  # torch raises half a dozen kinds for a file that is no checkpoint
-        raise CheckpointError(
-            f"{path} cannot be read as a checkpoint; it is damaged or another kind of file"
-        ) from error
-    if not isinstance(checkpoint, dict) or "lightning_pose" not in checkpoint:
-        raise CheckpointError(f"{path} was not written by lightning_pose; give a checkpoint that `fit` wrote")
-    return checkpoint | {"lightning_pose": resolve_class_paths(checkpoint["lightning_pose"])}
+__all__ = ["Localizer"]
 
 
 class Localizer:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from lightning_pose.errors import ConfigError
 from lightning_pose.geometry.quaternions import quat_normalize, relative_pose
@@ -13,7 +13,7 @@ from lightning_pose.geometry.relative import chain_steps
 from lightning_pose.models.base import Pose, PoseModule
 from lightning_pose.models.parts.motion import GEOMETRY_COLUMNS, MOTION_COLUMNS, matched_motion
 
-__all__ = ["ClipModule", "layer_responses"]
+__all__ = ["ClipModule"]
 
 
 class ClipModule(PoseModule):
@@ -113,37 +113,3 @@ class ClipModule(PoseModule):
 
     def _judged(self, pose: Pose) -> Pose:
         return Pose(pose.position_m[:, 1:], pose.quat_wxyz[:, 1:])
-
-
-@torch.no_grad()
-def layer_responses(model: ClipModule, clip: Tensor, layers: int = 2) -> dict[str, Tensor]:
-    """What the first convolutions of a network answer to one clip (thesis, fig. 6.5).
-
-    Args:
-        model: in any mode.
-        clip: (T, *input_shape).
-        layers: how many convolutions.
-
-    Returns:
-        `convolution 1`, `activation 1`, ...: (T, channels, height, width) each.
-    """
-    found: dict[str, Tensor] = {}
-    handles = []
-    for kind, name in (((nn.Conv2d, nn.Conv3d), "convolution"), ((nn.ReLU,), "activation")):
-        chosen = [module for module in model.network.modules() if isinstance(module, kind)][:layers]
-        for number, module in enumerate(chosen, 1):
-
-            def keep(_: nn.Module, __: Any, out: Tensor, name: str = f"{name} {number}") -> None:
-                # Conv3d answers (1, C, T, H, W), Conv2d over frames (T, C, H, W).
-                found[name] = (out[0].transpose(0, 1) if out.ndim == 5 else out).clone().cpu()
-
-            handles.append(module.register_forward_hook(keep))
-    training = model.training
-    try:
-        model.eval()(clip[None].to(model.device))
-    finally:
-        model.train(training)
-        for handle in handles:
-            handle.remove()
-    order = [f"{name} {number}" for number in range(1, layers + 1) for name in ("convolution", "activation")]
-    return {name: found[name] for name in order if name in found}

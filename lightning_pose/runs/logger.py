@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import os
-import socket
-import time
 import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
-from functools import cache
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,23 +15,14 @@ from lightning.fabric.utilities.rank_zero import rank_zero_only
 from lightning.pytorch.loggers import MLFlowLogger
 
 from lightning_pose.errors import CheckpointError
+from lightning_pose.paths import STORE_VARIABLE, default_tracking_uri
+from lightning_pose.runs.process import _process_has_died, process_tags
+from lightning_pose.runs.tags import PARENT_TAG
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
-    from mlflow.entities import Run
 
-__all__ = [
-    "PARENT_TAG",
-    "MLflowLogger",
-    "default_tracking_uri",
-    "flatten",
-    "has_died",
-    "last_run",
-    "log_localizer",
-    "machine",
-    "process_name",
-    "process_tags",
-]
+__all__ = ["MLflowLogger", "flatten", "last_run", "log_localizer"]
 
 REQUIREMENTS = (
     "torch",
@@ -51,15 +38,6 @@ REQUIREMENTS = (
 """What a logged model needs beside this package, which it carries along."""
 
 PACKAGE = Path(__file__).parents[1]
-
-STORE_VARIABLE = "MLFLOW_TRACKING_URI"
-HOST_TAG, PROCESS_TAG = "process.host", "process.id"
-PARENT_TAG = "mlflow.parentRunId"
-
-
-def default_tracking_uri(root: str | Path = "mlruns") -> str:
-    """`MLFLOW_TRACKING_URI`, or a database under `root`."""
-    return os.environ.get(STORE_VARIABLE) or f"sqlite:///{Path(root) / 'mlflow.db'}"
 
 
 class MLflowLogger(MLFlowLogger):
@@ -161,62 +139,6 @@ def _environment_kept() -> Iterator[None]:
         os.environ.pop(STORE_VARIABLE, None)
         if before is not None:
             os.environ[STORE_VARIABLE] = before
-
-
-@cache
-def machine() -> str:
-    """This machine: its name for people, and what tells it from others of that name, its own earlier boots included.
-
-    Process numbers mean something within one boot only, and within one container where it counts its own.
-    """
-    facts = []
-    with suppress(OSError):  # Linux alone has them
-        facts.append(Path("/proc/sys/kernel/random/boot_id").read_text().strip())
-    with suppress(OSError):
-        facts.append(str(Path("/proc/self/ns/pid").stat().st_ino))
-    digest = hashlib.sha256(" ".join(facts).encode()).hexdigest()[:8]
-    return f"{socket.gethostname()} {digest}" if facts else socket.gethostname()
-
-
-def process_name() -> str:
-    """This process, on whatever machine."""
-    return f"{machine()}:{os.getpid()}"
-
-
-def process_tags() -> dict[str, str]:
-    """By which a later run finds out that this process has died."""
-    return {HOST_TAG: machine(), PROCESS_TAG: str(os.getpid())}
-
-
-def has_died(process: str) -> bool:
-    """Whether a process, by its `process_name`, was of this machine and is gone; of other machines nothing is known."""
-    host, _, number = process.rpartition(":")
-    if host != machine():
-        return False
-    try:
-        os.kill(int(number), 0)
-    except ProcessLookupError:
-        return True
-    except PermissionError:
-        pass
-    return False
-
-
-def _process_has_died(run: Run) -> bool:
-    tags = run.data.tags
-    if HOST_TAG not in tags or PROCESS_TAG not in tags:
-        return False
-    host = tags[HOST_TAG]
-    if host != machine() and host.partition(" ")[0] == socket.gethostname():
-        return run.info.start_time / 1000 < _booted()  # before a power failure, say
-    return has_died(f"{host}:{tags[PROCESS_TAG]}")
-
-
-def _booted() -> float:
-    """When this machine started, in seconds since 1970; 0 where that is not known."""
-    if not hasattr(time, "CLOCK_BOOTTIME"):
-        return 0.0
-    return time.time() - time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
 def flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -13,11 +13,12 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
 from lightning_pose.figures.clips import CLIP_BASELINES
-from lightning_pose.figures.images import BASELINES, MODEL, OTHERS, STYLE, log_axis
+from lightning_pose.figures.style import BASELINES, MODEL, OTHERS, STYLE, log_axis
 from lightning_pose.scenes.images import read_rgb
-from lightning_pose.studies.figure_spec import SCENE, Exhibit
+from lightning_pose.studies.figure_spec import Exhibit
 from lightning_pose.studies.table import Cell, varying
 from lightning_pose.sweeps.keypoint_statistics import FrameKeypoints
+from lightning_pose.sweeps.space import SCENE
 
 __all__ = ["draw_cells", "draw_keypoints"]
 

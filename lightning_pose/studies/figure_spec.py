@@ -7,19 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from lightning_pose.errors import ConfigError
-from lightning_pose.sweeps.space import Parameter, nearest
+from lightning_pose.sweeps.space import BASE, MEASURES, Parameter, nearest
 
-__all__ = ["BASE", "MEASURES", "SCENE", "SEED", "Exhibit", "parse_exhibit"]
+__all__ = ["Exhibit", "parse_exhibit"]
 
-BASE, SEED, SCENE = "base", "seed_everything", "data.root"
-"""Parameters with a part of their own: which base config a trial has, what is averaged over, and a folder."""
-
-MEASURES = {
-    None: ("val/", "cost/"),
-    "test": ("val/", "test/", "cost/", "baseline/", "train/"),
-    "features": ("features/",),
-}
-"""What trials measure, and the metrics that they have then."""
 
 KINDS = ("line", "bar", "curve", "pictures")
 FIELDS = ("x", "y", "kind", "log", "beside", "title", "table", "labels")

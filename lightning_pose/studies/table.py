@@ -13,9 +13,10 @@ from typing import Any
 from optuna import Study
 from optuna.trial import FrozenTrial, TrialState
 
-from lightning_pose.studies.figure_spec import SCENE, SEED, Exhibit
+from lightning_pose.runs.tags import CURVES, METRICS, REASON
+from lightning_pose.studies.figure_spec import Exhibit
 from lightning_pose.sweeps.plan import Plan
-from lightning_pose.sweeps.trial import CURVES, METRICS, REASON
+from lightning_pose.sweeps.space import SCENE, SEED
 from lightning_pose.terminal import Sheet
 
 __all__ = ["Cell", "as_csv", "as_markdown", "as_sheet", "gather", "name_scenes", "named", "varying"]

@@ -8,9 +8,9 @@ from optuna import Study
 from optuna.trial import TrialState
 
 from lightning_pose.runs.logger import MLflowLogger
+from lightning_pose.runs.tags import RUN
 from lightning_pose.sweeps.plan import Plan
 from lightning_pose.sweeps.results import SHOWN, best_trials, short, tally
-from lightning_pose.sweeps.trial import RUN
 
 __all__ = ["close_parent", "close_run", "describe_parent", "open_parent"]
 

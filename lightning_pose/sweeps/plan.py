@@ -12,12 +12,12 @@ import numpy as np
 
 from lightning_pose.errors import ConfigError
 from lightning_pose.metrics.summary import summarize_errors
-from lightning_pose.runs.logger import default_tracking_uri
-from lightning_pose.studies.figure_spec import BASE, MEASURES, Exhibit, parse_exhibit
+from lightning_pose.paths import default_tracking_uri
+from lightning_pose.studies.figure_spec import Exhibit, parse_exhibit
 from lightning_pose.sweeps.base_config import ParsedConfig, check_known, keys, options, put, read_yaml, resolve
-from lightning_pose.sweeps.space import Parameter, by_class_path, check_when, nearest, parse_space
+from lightning_pose.sweeps.space import BASE, MEASURES, Parameter, by_class_path, check_when, nearest, parse_space
 
-__all__ = ["Objective", "Plan", "read_plan"]
+__all__ = ["MEASURES", "Objective", "Plan", "read_plan"]
 
 FIELDS = ("base", "objective", "sampler", "pruner", "n_trials", "seed", "settings", "space", "measure", "figure")
 COSTS = ("cost/parameters", "cost/layers", "cost/train_seconds", "cost/ms_per_frame", "cost/features_ms_per_frame")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,29 +11,11 @@ import yaml
 from optuna import Study
 from optuna.trial import FrozenTrial, TrialState
 
-from lightning_pose.errors import ConfigError
-from lightning_pose.studies.figure import draw_cells, draw_keypoints
-from lightning_pose.studies.figure_spec import SCENE, Exhibit
-from lightning_pose.studies.table import Cell, as_csv, as_markdown, as_sheet, gather, varying
-from lightning_pose.sweeps.base_config import ParsedConfig
-from lightning_pose.sweeps.keypoint_statistics import keypoints_of_a_frame
+from lightning_pose.runs.tags import REASON
 from lightning_pose.sweeps.plan import Objective, Plan
-from lightning_pose.sweeps.space import nearest
-from lightning_pose.sweeps.trial import REASON
 from lightning_pose.terminal import Sheet
 
-__all__ = [
-    "SHOWN",
-    "best_trial",
-    "best_trials",
-    "completed",
-    "draw_figures",
-    "sheet",
-    "short",
-    "show_study",
-    "tally",
-    "write_best",
-]
+__all__ = ["SHOWN", "best_trial", "best_trials", "completed", "draw_figures", "sheet", "short", "tally", "write_best"]
 
 SHOWN = 10
 
@@ -89,52 +71,6 @@ def _last_names(keys: list[str]) -> list[str]:
     """Keys without what they are in, where that leaves them apart: a terminal is narrow."""
     last = [key.rpartition(".")[2] for key in keys]
     return [name if last.count(name) == 1 else key for name, key in zip(last, keys, strict=True)]
-
-
-def show_study(study: Study, plan: Plan, folder: Path) -> tuple[list[Path], Sheet | None]:
-    """Draw a study's figure, and write its table as `table.md` and, with all that was measured, as `table.csv`.
-
-    Returns:
-        The files, and the table for the terminal; none for pictures, which have no numbers.
-
-    Raises:
-        ConfigError: it is to show what no trial has measured.
-    """
-    exhibit = plan.exhibit
-    if exhibit is None:
-        return [], None
-    cells = gather(study, plan)
-    _check_measured(cells, exhibit)
-    title = exhibit.title or study.study_name
-    if SCENE not in varying(cells):  # where it does, the scenes are named beside their curves
-        title = f"{title}, {plan.scene}"
-    figure = folder / "figure.png"
-    if exhibit.kind == "pictures":
-        shown = [cell for cell in cells if cell.metrics]
-        frames = [keypoints_of_a_frame(ParsedConfig(plan.arguments(cell.values))) for cell in shown]
-        names = [
-            cell.names[SCENE] if cell.values.get(SCENE) else frame.scene
-            for cell, frame in zip(shown, frames, strict=True)
-        ]
-        draw_keypoints(dict(zip(names, frames, strict=True)), title).savefig(figure)
-    else:
-        draw_cells(cells, exhibit, title).savefig(figure)
-    (folder / "table.csv").write_text(as_csv(cells, plan))
-    (folder / "table.md").write_text(as_markdown(cells, exhibit))
-    return [figure, folder / "table.csv", folder / "table.md"], as_sheet(cells, exhibit, title)
-
-
-def _check_measured(cells: Sequence[Cell], exhibit: Exhibit) -> None:
-    held = [found for cell in cells for found in (*cell.metrics, *cell.curves)]
-    known = sorted(set[str]().union(*held))
-    baselines = sorted({name.split("/")[1] for name in known if name.startswith("baseline/")})
-    again = "correct the file, and the same command draws what there is"
-    for name in (*exhibit.y, *exhibit.table):
-        if name not in known:
-            raise ConfigError(f"figure shows {name}, which no trial has measured ({nearest(name, known)}); {again}")
-    for name in exhibit.beside:
-        if name not in baselines:
-            raise ConfigError(f"figure.beside has {name}, which is no baseline ({nearest(name, baselines)}); {again}")
 
 
 def short(value: Any) -> str:

@@ -17,7 +17,19 @@ from lightning_pose.errors import ConfigError
 if TYPE_CHECKING:
     from optuna import Trial
 
-__all__ = ["Parameter", "by_class_path", "check_when", "draw", "grid", "nearest", "parse_space"]
+__all__ = [
+    "BASE",
+    "MEASURES",
+    "SCENE",
+    "SEED",
+    "Parameter",
+    "by_class_path",
+    "check_when",
+    "draw",
+    "grid",
+    "nearest",
+    "parse_space",
+]
 
 Scalar = str | int | float | bool | None
 
@@ -276,3 +288,14 @@ def nearest(name: str, known: Iterable[Any]) -> str:
     if near:
         return f"did you mean {near[0]}?"
     return f"choose one of {', '.join(known)}" if len(known) <= 20 else "see `python -m lightning_pose fit --help`"
+
+
+BASE, SEED, SCENE = "base", "seed_everything", "data.root"
+"""Parameters with a part of their own: which base config a trial has, what is averaged over, and a folder."""
+
+MEASURES = {
+    None: ("val/", "cost/"),
+    "test": ("val/", "test/", "cost/", "baseline/", "train/"),
+    "features": ("features/",),
+}
+"""What trials measure, and the metrics that they have then."""

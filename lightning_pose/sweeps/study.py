@@ -19,13 +19,13 @@ from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
 from lightning_pose.errors import ConfigError
-from lightning_pose.runs.logger import has_died
+from lightning_pose.runs.process import has_died
+from lightning_pose.runs.tags import PROCESS, REASON, RUN
 from lightning_pose.sweeps.outages import PatientStorage
 from lightning_pose.sweeps.parent_run import close_run
 from lightning_pose.sweeps.plan import Plan
 from lightning_pose.sweeps.space import grid, nearest
 from lightning_pose.sweeps.storage import alone, connect
-from lightning_pose.sweeps.trial import PROCESS, REASON, RUN
 
 __all__ = [
     "attach",

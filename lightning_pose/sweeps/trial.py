@@ -20,21 +20,18 @@ from optuna.exceptions import OptunaError
 
 from lightning_pose.cli import PoseCLI
 from lightning_pose.errors import ConfigError, PoseError
-from lightning_pose.evaluation import TestReport
-from lightning_pose.evaluation.result import costs
+from lightning_pose.evaluation.callback import TestReport
+from lightning_pose.evaluation.costs import costs
 from lightning_pose.models.parts.ridge import shared_factors
-from lightning_pose.runs.logger import PARENT_TAG, process_tags
-from lightning_pose.runs.recorder import BestCheckpoint, checkpoint_folder, run_logger
+from lightning_pose.runs.checkpoints import BestCheckpoint, checkpoint_folder, run_logger
+from lightning_pose.runs.process import process_tags
+from lightning_pose.runs.tags import CURVES, METRICS, PARENT_TAG, REASON, RUN
 from lightning_pose.sweeps.base_config import ParsedConfig
 from lightning_pose.sweeps.keypoint_statistics import measure_features
 from lightning_pose.sweeps.plan import Plan
 from lightning_pose.sweeps.space import draw
 
-__all__ = ["CURVES", "METRICS", "PROCESS", "REASON", "RUN", "run_trial"]
-
-PROCESS, REASON, RUN = "process", "reason", "mlflow_run"
-METRICS, CURVES = "metrics", "curves"
-"""What Optuna keeps of a trial beside its values: who runs it, why it ended early, its run, and what it measured."""
+__all__ = ["run_trial"]
 
 
 class EpochWatch(Callback):

@@ -22,12 +22,13 @@ from optuna.exceptions import UpdateFinishedTrialError
 from optuna.storages import fail_stale_trials
 from optuna.trial import FrozenTrial, TrialState
 
-from lightning_pose.runs.logger import process_name
+from lightning_pose.runs.process import process_name
+from lightning_pose.runs.tags import PROCESS
 from lightning_pose.sweeps.outages import PatientStorage
 from lightning_pose.sweeps.plan import Plan
 from lightning_pose.sweeps.storage import alone
 from lightning_pose.sweeps.study import attach, is_grid, open_storage, queue_again, recover, waiting
-from lightning_pose.sweeps.trial import PROCESS, run_trial
+from lightning_pose.sweeps.trial import run_trial
 
 __all__ = ["Job", "run_alone", "run_together"]
 

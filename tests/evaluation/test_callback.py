@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 import torch
 
-from lightning_pose.evaluation import print_results
-from lightning_pose.evaluation.callback import NOTE, describe_run
-from lightning_pose.evaluation.result import count_layers
+from lightning_pose.evaluation.callback import describe_run
+from lightning_pose.evaluation.costs import count_layers
+from lightning_pose.evaluation.table import print_results
 from lightning_pose.geometry.quaternions import orientation_error_deg, position_error_m
 from lightning_pose.metrics.summary import summarize_errors
 from lightning_pose.models import DensePoseNet, LinearPoseNet, NodePose, SurfCNN, SurfLSTM
 from lightning_pose.models.base import PoseModule
 from lightning_pose.runs.logger import MLflowLogger
+from lightning_pose.runs.tags import NOTE
 from lightning_pose.scenes.formats import load_scene
 from tests.helpers import Trained, Workplace
 

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from lightning_pose.figures.images import Errors, cumulative_errors, error_vs_distance, trajectory
+from lightning_pose.figures.images import cumulative_errors, error_vs_distance, trajectory
+from lightning_pose.figures.style import Errors
 
 RNG = np.random.default_rng(0)
 PATH = np.stack([np.linspace(0, 4, 60), np.zeros(60), np.sin(np.linspace(0, 3, 60))], axis=1)

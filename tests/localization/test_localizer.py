@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from lightning_pose.checkpoint import read_checkpoint
 from lightning_pose.errors import CheckpointError, ImageError
-from lightning_pose.localization.localizer import Localizer, read_checkpoint
+from lightning_pose.localization.localizer import Localizer
 from lightning_pose.scenes.images import read_gray
 from tests.helpers import Thumbnails, Trained
 

@@ -10,9 +10,9 @@ from lightning import Trainer
 from torch import Tensor
 
 from lightning_pose.errors import ConfigError
+from lightning_pose.evaluation.responses import layer_responses
 from lightning_pose.geometry.relative import relative_poses
 from lightning_pose.models import CNN3D, CNNRNN, ClipModule
-from lightning_pose.models.clip import layer_responses
 from lightning_pose.models.parts.motion import matched_motion
 from tests.models.helpers import ClipProblem, features_for
 

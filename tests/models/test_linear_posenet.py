@@ -19,7 +19,7 @@ from lightning_pose.errors import ConfigError
 from lightning_pose.geometry.quaternions import align_hemisphere
 from lightning_pose.losses import LossConfig
 from lightning_pose.models import LinearPoseNet
-from lightning_pose.runs.recorder import BestCheckpoint, LastCheckpoint
+from lightning_pose.runs.checkpoints import BestCheckpoint, LastCheckpoint
 from tests.models.helpers import LearnableProblem, random_poses
 
 D = 16

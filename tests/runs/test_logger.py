@@ -14,16 +14,9 @@ from pathlib import Path
 import pytest
 
 from lightning_pose.errors import CheckpointError
-from lightning_pose.runs.logger import (
-    REQUIREMENTS,
-    MLflowLogger,
-    default_tracking_uri,
-    flatten,
-    has_died,
-    last_run,
-    machine,
-    process_name,
-)
+from lightning_pose.paths import default_tracking_uri
+from lightning_pose.runs.logger import REQUIREMENTS, MLflowLogger, flatten, last_run
+from lightning_pose.runs.process import has_died, machine, process_name
 from tests.helpers import Trained, Workplace
 
 DISTRIBUTIONS = {"cv2": "opencv-contrib-python-headless", "yaml": "PyYAML", "sklearn": "scikit-learn"}

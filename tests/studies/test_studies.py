@@ -120,7 +120,7 @@ def test_lambda_and_components_factorise_once(
 ) -> None:
     config = yaml.safe_load(workplace.config.read_text())
     config["model"] = {"class_path": "lightning_pose.models.LinearPoseNet", "init_args": {}}
-    config["data"]["init_args"]["extractor"] = {"class_path": "tests.test_studies.Flat"}
+    config["data"]["init_args"]["extractor"] = {"class_path": "tests.studies.test_studies.Flat"}
     (workplace.folder / "tiny.yaml").write_text(yaml.safe_dump(config))
     sizes = []
     eigh = torch.linalg.eigh

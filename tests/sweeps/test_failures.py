@@ -19,7 +19,7 @@ from mlflow.exceptions import MlflowException
 from optuna.exceptions import StorageInternalError
 from optuna.trial import FrozenTrial, TrialState
 
-from lightning_pose.runs.logger import machine, process_name
+from lightning_pose.runs.process import machine, process_name
 from lightning_pose.sweeps import trial, workers
 from lightning_pose.sweeps.outages import PatientStorage
 from lightning_pose.sweeps.plan import Plan, read_plan

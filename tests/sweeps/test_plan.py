@@ -65,7 +65,7 @@ def test_what_others_wait_for_may_be_narrowed_away(sweep: Write) -> None:
 def test_a_class_that_is_searched_is_written_with_its_settings(sweep: Write, workplace: Workplace) -> None:
     """As the trial had it: the command line keeps what the next class takes too."""
     thumbnails = {"data.extractor.rows": 5}
-    extractors = ["tests.helpers.Thumbnails", "tests.test_studies.Flat"]
+    extractors = ["tests.helpers.Thumbnails", "tests.studies.test_studies.Flat"]
     plan = read_plan(sweep(settings=thumbnails, space={"data.extractor": extractors}), {})
     values = {plan.space[0].key: extractors[1]}
     config = plan.config(values)["data"]["init_args"]["extractor"]

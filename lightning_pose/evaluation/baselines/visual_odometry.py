@@ -16,24 +16,36 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemaining
 from torch import Tensor
 
 from lightning_pose.errors import ConfigError
+from lightning_pose.features.matching import match_descriptors
 from lightning_pose.features.opencv import SIFT
-from lightning_pose.geometry.quaternions import matrix_to_quat, quat_rotate
+from lightning_pose.geometry.quaternions import quat_rotate
 from lightning_pose.geometry.relative import RelativeFrame, chain_steps, check_relative_frame
+from lightning_pose.geometry.two_view import MIN_INLIERS, two_view_motion
 from lightning_pose.scenes.scene import Frame, Intrinsics
 
-__all__ = ["Motion", "View", "clip_poses", "two_view_motion", "visual_odometry"]
+__all__ = ["Motion", "View", "clip_poses", "match_motion", "visual_odometry"]
 
 N_FEATURES = 1000
-RATIO = 0.8  # Lowe's: the best match must be this much nearer than the second best
-INLIER_PX = 1.0
-MIN_INLIERS = 12
-"""With fewer, the motion is a guess. Of frames of an office half a second apart, 20 degrees turned, 8 or 9 inliers gave
-a better rotation than none at all for 41 %, 10 or 11 for 82 %, 12 to 14 for 85 %, 15 to 19 for 96 %."""
 
 FOCAL_PER_SIDE = 525 / 640
 """Focal length by the image's longer side, where a dataset does not tell the camera: that of 7-Scenes' Kinect."""
 
 CHUNK = 8  # steps a worker gets at a time: it bounds how many images' features are held
+
+
+@dataclass(frozen=True)
+class View:
+    """What of an image takes part in odometry.
+
+    Attributes:
+        points: (N, 2) float64 in normalised image coordinates, (pixel - centre) / focal length.
+        descriptors: (N, D) float32, L2-normalised.
+        focal_px: pixels to one normalised unit.
+    """
+
+    points: np.ndarray
+    descriptors: np.ndarray
+    focal_px: float
 
 
 @dataclass(frozen=True)
@@ -51,21 +63,6 @@ class Motion:
     quat_wxyz: Tensor
     failed_steps: int
     steps: int
-
-
-@dataclass(frozen=True)
-class View:
-    """What of an image takes part in odometry.
-
-    Attributes:
-        points: (N, 2) float64 in normalised image coordinates, (pixel - centre) / focal length.
-        descriptors: (N, D) float32, L2-normalised.
-        focal_px: pixels to one normalised unit.
-    """
-
-    points: np.ndarray
-    descriptors: np.ndarray
-    focal_px: float
 
 
 def visual_odometry(
@@ -127,62 +124,10 @@ def clip_poses(frames: Sequence[Frame], clips: np.ndarray | Tensor) -> tuple[Ten
     return position_m.view(-1, 3)[rows], quat_wxyz.view(-1, 4)[rows]
 
 
-def two_view_motion(a: View, b: View) -> tuple[Tensor, Tensor] | None:
-    """Where camera b is, seen from camera a, up to scale: essential matrix of the matches, by RANSAC.
-
-    OpenCV's USAC_ACCURATE: on two videos its rotations were 12 to 37 % nearer the truth (median) than those of its
-    plain RANSAC. An essential matrix has two rotations, half a turn apart: the smaller one is taken. `recoverPose`
-    asks instead which has more points in front of both cameras, and does not count those farther than 50 steps, which
-    in a slow video are all of them: a tenth of a kitchen's steps, 8 mm each, came out half a turn wrong.
-
-    Returns:
-        position (3,), unit length, in the axes of a, and quat_wxyz (4,); `T_a^-1 T_b` but for the scale. None if
-        there are fewer than `MIN_INLIERS` matches, or as few agree on a motion, or nothing moved at all.
-    """
-    points_a, points_b = _matches(a, b)
-    if len(points_a) < MIN_INLIERS:
-        return None
-    threshold = INLIER_PX / (0.5 * (a.focal_px + b.focal_px))
-    essential, mask = cv2.findEssentialMat(
-        points_a, points_b, np.eye(3), method=cv2.USAC_ACCURATE, prob=0.999, threshold=threshold
-    )
-    if essential is None or essential.shape != (3, 3) or np.count_nonzero(mask) < MIN_INLIERS:
-        return None
-    # x_b = R x_a + t in the coordinates of each camera, so that b is at -R^T t, turned by R^T.
-    first, second, t = cv2.decomposeEssentialMat(essential)
-    R = max((first, second), key=np.trace)
-    inlier = mask.ravel() > 0
-    t = t.ravel() * _side(points_a[inlier], points_b[inlier], R, t.ravel())
-    return torch.from_numpy(-R.T @ t), matrix_to_quat(torch.from_numpy(R.T.copy()))
-
-
-def _matches(a: View, b: View) -> tuple[np.ndarray, np.ndarray]:
-    """(M, 2) and (M, 2) points of features that are each other's nearest, and much nearer than the second."""
-    if len(a.points) < MIN_INLIERS or len(b.points) < MIN_INLIERS:
-        return a.points[:0], b.points[:0]
-    squared = 2 - 2 * (a.descriptors @ b.descriptors.T)
-    rows, nearest = np.arange(len(squared)), squared.argmin(axis=1)
-    mutual = squared.argmin(axis=0)[nearest] == rows
-    best = squared[rows, nearest]
-    squared[rows, nearest] = np.inf
-    keep = mutual & (best < RATIO**2 * squared.min(axis=1))
-    return a.points[keep], b.points[nearest[keep]]
-
-
-def _side(points_a: np.ndarray, points_b: np.ndarray, R: np.ndarray, t: np.ndarray) -> int:
-    """1 or -1: the sign of t with which more points lie in front of camera a.
-
-    From `z_b x_b = z_a R x_a + t`, `z_a (R x_a) x x_b = x_b x t`.
-    """
-    rays_a, rays_b = (np.column_stack([points, np.ones(len(points))]) for points in (points_a, points_b))
-    depth_sign = np.sign((np.cross(rays_a @ R.T, rays_b) * np.cross(rays_b, t)).sum(axis=1))
-    return 1 if depth_sign.sum() >= 0 else -1
-
-
 def _estimate(
     frames: Sequence[Frame], pairs: list[tuple[int, int]], workers: int, progress: bool
 ) -> list[tuple[Tensor, Tensor] | None]:
-    """`two_view_motion` of each pair, in order; the features of an image live from its first pair to its last."""
+    """`match_motion` of each pair, in order; the features of an image live from its first pair to its last."""
     last_use = {image: number for number, pair in enumerate(pairs) for image in pair}
     views: dict[int, View] = {}
     size, found = CHUNK * workers, []
@@ -202,7 +147,15 @@ def _estimate(
 def _step(views: tuple[View, View]) -> tuple[Tensor, Tensor] | None:
     if views[0] is views[1]:  # a frame repeated has not moved, which is no failure
         return torch.zeros(3).double(), torch.eye(4)[0].double()
-    return two_view_motion(*views)
+    return match_motion(*views)
+
+
+def match_motion(a: View, b: View) -> tuple[Tensor, Tensor] | None:
+    """`two_view_motion` of the matches of two views; None where a view has too few features."""
+    if len(a.points) < MIN_INLIERS or len(b.points) < MIN_INLIERS:
+        return None
+    rows_a, rows_b = match_descriptors(a.descriptors, b.descriptors)
+    return two_view_motion(a.points[rows_a], b.points[rows_b], 0.5 * (a.focal_px + b.focal_px))
 
 
 def _view(frame: Frame) -> View:

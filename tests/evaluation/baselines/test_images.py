@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from lightning_pose.errors import ConfigError
-from lightning_pose.evaluation.baselines.images import BaselineResult, evaluate_baselines, global_vectors, nearest
+from lightning_pose.evaluation.baselines.images import BaselineResult, evaluate_baselines
+from lightning_pose.features.retrieval import global_vectors, nearest
 from lightning_pose.geometry.quaternions import orientation_error_deg, position_error_m, quat_normalize
 
 NAMES = ["train_mean", "retrieval_top1", "retrieval_top5", "oracle"]

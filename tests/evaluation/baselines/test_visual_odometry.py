@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from lightning_pose.errors import ConfigError, ImageError
 from lightning_pose.evaluation.baselines import visual_odometry as module
-from lightning_pose.evaluation.baselines.visual_odometry import View, clip_poses, two_view_motion, visual_odometry
+from lightning_pose.evaluation.baselines.visual_odometry import View, clip_poses, match_motion, visual_odometry
 from lightning_pose.geometry.quaternions import orientation_error_deg, position_error_m, quat_rotate
 from lightning_pose.geometry.relative import RelativeFrame, relative_poses
 from lightning_pose.scenes.formats import load_scene
@@ -58,7 +58,7 @@ def views(
 @pytest.mark.parametrize("turn_deg", [(0.0, 0.0, 0.0), (3.0, -5.0, 8.0), (0.0, 20.0, 0.0)])
 @pytest.mark.parametrize("position", [(0.3, 0.0, 0.0), (-0.1, 0.2, 0.1), (0.0, 0.0, 0.3), (0.0, 0.0, -0.3)])
 def test_the_motion_is_the_pose_of_the_second_camera_seen_from_the_first(position: Vector, turn_deg: Vector) -> None:
-    motion = two_view_motion(*views(position, turn_deg))
+    motion = match_motion(*views(position, turn_deg))
     assert motion is not None
     direction = torch.nn.functional.normalize(torch.tensor(position).double(), dim=0)
     quat = Rotation.from_euler("xyz", turn_deg, degrees=True).as_quat(scalar_first=True)
@@ -70,14 +70,14 @@ def test_the_motion_is_the_pose_of_the_second_camera_seen_from_the_first(positio
 def test_slow_motion_is_not_half_a_turn_wrong() -> None:
     """Points 1000 steps away: as in a video, where OpenCV's recoverPose counts none of them."""
     for x in (0.004, -0.004):
-        motion = two_view_motion(*views((x, 0.0, 0.0), (0.2, 0.3, 0.1)))
+        motion = match_motion(*views((x, 0.0, 0.0), (0.2, 0.3, 0.1)))
         assert motion is not None
         quat = Rotation.from_euler("xyz", (0.2, 0.3, 0.1), degrees=True).as_quat(scalar_first=True)
         assert orientation_error_deg(motion[1], torch.from_numpy(quat)) < 0.15
 
 
 def test_a_turn_on_the_spot_is_seen() -> None:
-    motion = two_view_motion(*views((0.0, 0.0, 0.0), (2.0, -6.0, 1.0)))
+    motion = match_motion(*views((0.0, 0.0, 0.0), (2.0, -6.0, 1.0)))
     assert motion is not None
     quat = Rotation.from_euler("xyz", (2.0, -6.0, 1.0), degrees=True).as_quat(scalar_first=True)
     assert orientation_error_deg(motion[1], torch.from_numpy(quat)) < 0.15
@@ -86,12 +86,12 @@ def test_a_turn_on_the_spot_is_seen() -> None:
 def test_no_motion_is_found_where_too_little_matches() -> None:
     a, b = views((0.3, 0.0, 0.0), (0.0, 0.0, 0.0))
     rng = np.random.default_rng(1)
-    assert two_view_motion(*views((0.3, 0.0, 0.0), (0.0, 0.0, 0.0), n=11)) is None
-    assert two_view_motion(View(a.points[:0], a.descriptors[:0], FOCAL_PX), b) is None
+    assert match_motion(*views((0.3, 0.0, 0.0), (0.0, 0.0, 0.0), n=11)) is None
+    assert match_motion(View(a.points[:0], a.descriptors[:0], FOCAL_PX), b) is None
     strangers = rng.normal(size=b.descriptors.shape)
     strangers /= np.linalg.norm(strangers, axis=1, keepdims=True)
-    assert two_view_motion(a, View(b.points, strangers.astype(np.float32), FOCAL_PX)) is None
-    assert two_view_motion(View(a.points[:20], a.descriptors[:20], FOCAL_PX), _scattered(a, 20)) is None
+    assert match_motion(a, View(b.points, strangers.astype(np.float32), FOCAL_PX)) is None
+    assert match_motion(View(a.points[:20], a.descriptors[:20], FOCAL_PX), _scattered(a, 20)) is None
 
 
 def _scattered(view: View, n: int) -> View:
@@ -147,7 +147,7 @@ def test_overlapping_clips_share_images_and_steps(room: Scene, monkeypatch: pyte
 
     monkeypatch.setattr(module, "CHUNK", 1)
     monkeypatch.setattr(module, "_view", view)
-    monkeypatch.setattr(module, "two_view_motion", motion)
+    monkeypatch.setattr(module, "match_motion", motion)
     clips = np.lib.stride_tricks.sliding_window_view(np.arange(6), 4)
     found = visual_odometry(room.frames, clips, progress=False, workers=2)
     assert sorted(described) == list(range(6))

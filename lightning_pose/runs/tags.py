@@ -1,0 +1,24 @@
+"""Names under which runs and trials keep what later code looks up."""
+
+__all__ = ["CURVES", "METRICS", "NOTE", "PARENT_TAG", "PROCESS", "REASON", "RUN"]
+
+PARENT_TAG = "mlflow.parentRunId"
+"""Tag of an MLflow run: the id of the run that it is nested in."""
+
+NOTE = "mlflow.note.content"
+"""Tag that MLflow shows as a run's description, in Markdown."""
+
+PROCESS = "process"
+"""User attribute of an Optuna trial: the process that runs it."""
+
+REASON = "reason"
+"""User attribute of an Optuna trial: why it ended without a value."""
+
+RUN = "mlflow_run"
+"""User attribute of an Optuna trial, and of a study: the id of its MLflow run."""
+
+METRICS = "metrics"
+"""User attribute of an Optuna trial: everything that it measured, by metric name."""
+
+CURVES = "curves"
+"""User attribute of an Optuna trial: metrics over a whole number, such as a clip's length."""
