@@ -1,21 +1,24 @@
-"""How good a whole trajectory is: absolute and relative pose error by `evo`, and drift by length, as KITTI has it."""
+"""Errors of a whole trajectory: absolute and relative pose error, and drift by length, as KITTI has it."""
 
 from __future__ import annotations
 
 import math
 import statistics
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from lightning_pose.errors import ConfigError, DataError
-from lightning_pose.geometry.quaternions import orientation_error_deg, position_error_m, quat_normalize, relative_pose
-
-if TYPE_CHECKING:
-    from evo.core.trajectory import PosePath3D
+from lightning_pose.geometry.quaternions import (
+    compose_pose,
+    orientation_error_deg,
+    position_error_m,
+    quat_normalize,
+    relative_pose,
+)
 
 __all__ = ["Drift", "drift_by_length", "mean_over_sequences", "trajectory_errors"]
 
@@ -44,7 +47,7 @@ class Drift(NamedTuple):
 
 
 def trajectory_errors(position_hat: Array, quat_hat: Array, position: Array, quat: Array) -> dict[str, float]:
-    """Absolute and relative errors of one sequence's trajectory (Sturm et al., IROS 2012), as `evo` measures them.
+    """Absolute and relative errors of one sequence's trajectory (Sturm et al., IROS 2012), defined as in `evo`.
 
     - `ate_rmse_m`: position error once the whole trajectory is laid on the truth by the best rotation and
       translation, without scale (Umeyama, PAMI 1991): `evo_ape -a`. It measures the shape alone. Where the best
@@ -132,45 +135,33 @@ def _checked(position_hat: Array, quat_hat: Array, position: Array, quat: Array)
 
 
 def _measured(hat: Poses, truth: Poses) -> dict[str, float]:
-    from evo.core.metrics import APE, RPE, PoseRelation, StatisticsType  # brings in scipy's rotations: half a second
-    from evo.core.trajectory import PosePath3D
-
-    # evo aligns in place, and copies what it is given
-    reference, shape, anchored = (PosePath3D(p.numpy(), q.numpy()) for p, q in (truth, hat, hat))
-    _align(shape, reference)
-    anchored.align_origin(reference)
-    metres, degrees = PoseRelation.translation_part, PoseRelation.rotation_angle_deg
-    measures = {
-        "ate_rmse_m": (APE(metres), shape),
-        "ate_origin_rmse_m": (APE(metres), anchored),
-        "rpe_rmse_m": (RPE(metres, delta=1), anchored),
-        "rpe_rmse_deg": (RPE(degrees, delta=1), anchored),
+    """The four metrics of two finite trajectories of at least two poses."""
+    aligned = _align_positions(hat[0].numpy(), truth[0].numpy())
+    start = compose_pose(truth[0][0], truth[1][0], *relative_pose(hat[0][0], hat[1][0], hat[0], hat[1]))[0]
+    step_hat, step = (relative_pose(p[:-1], q[:-1], p[1:], q[1:]) for p, q in (hat, truth))
+    return {
+        "ate_rmse_m": _root_mean_square(np.linalg.norm(aligned - truth[0].numpy(), axis=1)),
+        "ate_origin_rmse_m": _root_mean_square(position_error_m(start, truth[0]).numpy()),
+        "rpe_rmse_m": _root_mean_square(relative_pose(*step, *step_hat)[0].norm(dim=1).numpy()),
+        "rpe_rmse_deg": _root_mean_square(orientation_error_deg(step_hat[1], step[1]).numpy()),
     }
-    for metric, path in measures.values():
-        metric.process_data((reference, path))
-    return {name: float(metric.get_statistic(StatisticsType.rmse)) for name, (metric, _) in measures.items()}
 
 
-def _align(path: PosePath3D, reference: PosePath3D) -> None:
-    """Move a path onto the reference by the least squares of its positions, where `evo` refuses too.
+def _root_mean_square(errors: np.ndarray) -> float:
+    return math.sqrt(np.mean(errors**2))
 
-    It does where the rotation is not unique: on a straight line, or where either stands still. The least squares are
-    the same for all the best rotations, so one of them serves. To align by the translation alone would not: the
-    error of a straight walk would leap with the last digit of its straightness.
+
+def _align_positions(points: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    """Points (M, 3) moved by the rotation and translation nearest to the targets (Umeyama, PAMI 1991, without scale).
+
+    Where the best rotation is not unique (on a straight line, or where either stands still), one of the best serves:
+    the sum of squares is the same for all. To align by the translation alone would not do: the error of a straight
+    walk would leap with the last digit of its straightness.
     """
-    from evo.core.geometry import GeometryException
-
-    try:
-        path.align(reference)
-    except GeometryException:
-        points, targets = path.positions_xyz, reference.positions_xyz
-        centre, target = points.mean(axis=0), targets.mean(axis=0)
-        left, _, right = np.linalg.svd((targets - target).T @ (points - centre))
-        left[:, 2] *= np.sign(np.linalg.det(left) * np.linalg.det(right))  # a rotation, not a mirror
-        move = np.eye(4)
-        move[:3, :3] = left @ right
-        move[:3, 3] = target - move[:3, :3] @ centre
-        path.transform(move)
+    centre, target = points.mean(axis=0), targets.mean(axis=0)
+    left, _, right = np.linalg.svd((targets - target).T @ (points - centre))
+    left[:, 2] *= np.sign(np.linalg.det(left) * np.linalg.det(right))  # a rotation, not a mirror
+    return (points - centre) @ (left @ right).T + target
 
 
 def _drift(hat: Poses, truth: Poses, length: int) -> tuple[float, float, float, int]:
