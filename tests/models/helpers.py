@@ -86,7 +86,10 @@ def problem_for(model: PoseModule) -> LearnableProblem:
 
 
 class LearnableProblem(LightningDataModule):
-    """Frames whose features are the pose times a fixed random matrix, so that there is all to learn and no noise."""
+    """Frames whose features are the pose times a fixed random matrix, so that there is all to learn and no noise.
+
+    Each split has frames of its own, so that code which reads the test split while fitting gives other results.
+    """
 
     def __init__(self, input_shape: list[int], count: int = 24) -> None:
         super().__init__()
@@ -97,12 +100,24 @@ class LearnableProblem(LightningDataModule):
         features = (pose @ mix).reshape(count, *input_shape)
         self.data = PoseDataset(PoseBatch(features, position_m, quat_wxyz, torch.arange(count)))
         self.learnt = self.data.data
+        self.held_out = {
+            split: PoseDataset(_other_frames(mix, input_shape, pose_count=count // 2, seed=seed))
+            for split, seed in (("val", 21), ("test", 22))
+        }
 
     def dataset(self, split: str) -> PoseDataset:
-        return self.data
+        return self.data if split == "train" else self.held_out[split]
 
     def train_dataloader(self) -> DataLoader[PoseBatch]:
         return batch_loader(self.data, batch_size=8, shuffle=True)
+
+
+def _other_frames(mix: torch.Tensor, input_shape: list[int], pose_count: int, seed: int) -> PoseBatch:
+    """Frames of another split: other poses, and numbers that no training frame has."""
+    position_m, quat_wxyz = random_poses(pose_count, seed)
+    pose = torch.cat([position_m, quat_wxyz], dim=-1)
+    features = (pose @ mix).reshape(pose_count, *input_shape)
+    return PoseBatch(features, position_m, quat_wxyz, 1000 * seed + torch.arange(pose_count))
 
 
 class ClipProblem(LearnableProblem):

@@ -37,9 +37,13 @@ class NoisyProblem(LearnableProblem):
         whole = PoseBatch(features, position_m, quat_wxyz, torch.arange(count + val))
         train, self.held = (PoseBatch(*parts) for parts in zip(*(t.split([count, val]) for t in whole), strict=True))
         self.data = PoseDataset(train)
+        # Other frames under other noise: whatever learns from the test split while fitting is found out.
+        position_m, quat_wxyz = random_poses(count, seed=11)
+        strange = PoseBatch(torch.randn(count, D, generator=generator), position_m, quat_wxyz, torch.arange(count))
+        self.strange = PoseDataset(strange._replace(frame=strange.frame + count + val))
 
     def dataset(self, split: str) -> PoseDataset:
-        return self.data if split == "train" else PoseDataset(self.held)
+        return {"train": self.data, "val": PoseDataset(self.held), "test": self.strange}[split]
 
     def val_dataloader(self) -> DataLoader[PoseBatch] | list[Any]:
         return batch_loader(self.dataset("val"), batch_size=5, shuffle=False) if len(self.held.frame) else []
