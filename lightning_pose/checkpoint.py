@@ -1,4 +1,8 @@
-"""Plain descriptions of objects: a class path and plain constructor arguments, as config files write them."""
+"""What checkpoints hold besides weights: objects as plain specs (class path, arguments), and reading the files.
+
+A spec is what config files write: `describe` makes it from an object, `build` makes the object from it.
+`read_checkpoint` reads a file that `fit` wrote; class paths of older versions are replaced by today's.
+"""
 
 from __future__ import annotations
 
@@ -64,17 +68,15 @@ def resolve_class_path(path: str) -> str:
 
 
 def resolve_class_paths(config: Any) -> Any:
-    """A config's or a spec's nested values, every `class_path` in them replaced by today's."""
+    """A config's or a spec's nested values, each class path replaced by today's.
+
+    Configs name a class by `class_path` or by a bare string, as in `extractor: lightning_pose.features.SURF`.
+    """
     if isinstance(config, Mapping):
-        return {
-            key: resolve_class_path(value)
-            if key == "class_path" and isinstance(value, str)
-            else resolve_class_paths(value)
-            for key, value in config.items()
-        }
+        return {key: resolve_class_paths(value) for key, value in config.items()}
     if isinstance(config, list):
         return [resolve_class_paths(value) for value in config]
-    return config
+    return resolve_class_path(config) if isinstance(config, str) else config
 
 
 def class_path(obj: object) -> str:

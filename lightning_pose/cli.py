@@ -12,13 +12,13 @@ from typing import Any, NoReturn
 
 import torch
 import yaml
-from jsonargparse import DefaultHelpFormatter
+from jsonargparse import DefaultHelpFormatter, get_loader, set_loader
 from lightning import LightningDataModule, Trainer
 from lightning.pytorch.callbacks import Timer
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
-from lightning_pose.checkpoint import read_checkpoint
+from lightning_pose.checkpoint import read_checkpoint, resolve_class_paths
 from lightning_pose.errors import CheckpointError, ConfigError
 from lightning_pose.evaluation.callback import TestReport
 from lightning_pose.localization.sequences import chain_test
@@ -37,11 +37,27 @@ class _HelpFormatter(argparse.RawDescriptionHelpFormatter, DefaultHelpFormatter)
     """Keeps the examples as they are written."""
 
 
+PARSER_MODE = "yaml_with_renames"
+
+
+def load_with_renames(text: str) -> Any:
+    """A YAML value in which classes have today's paths: a config's whole content, or one value of a command line."""
+    return resolve_class_paths(get_loader("yaml")(text))
+
+
+set_loader(PARSER_MODE, load_with_renames, exceptions=(yaml.YAMLError,))
+
+
 class PoseParser(LightningArgumentParser):
-    """A parser that raises ConfigError, so that a wrong setting ends in one line like any other mistake."""
+    """A parser that reads older class paths by today's, and raises ConfigError for a wrong setting.
+
+    The error ends in one line like any other mistake of a user.
+    """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, formatter_class=_HelpFormatter, **kwargs)
+        # jsonargparse makes parsers of this class for nested settings too, with the mode of the outer parser.
+        settings = {"formatter_class": _HelpFormatter} | kwargs | {"parser_mode": PARSER_MODE}
+        super().__init__(*args, **settings)
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         raise ConfigError(_one_line(message)) from ex

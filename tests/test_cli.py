@@ -10,8 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import yaml
 
+from lightning_pose.cli import PoseCLI
+from lightning_pose.data import ImageDataModule
 from lightning_pose.localization.localizer import Localizer
+from lightning_pose.sweeps.base_config import resolve
 from tests.helpers import Trained, Workplace
 
 DEAD_PROCESS = 2**22 + 1  # beyond the largest number that Linux gives
@@ -209,3 +213,42 @@ def test_help(verb: str, workplace: Workplace, capsys: pytest.CaptureFixture[str
         workplace.command(verb, "--help")
     assert stop.value.code == 0
     assert "--ckpt_path" in capsys.readouterr().out
+
+
+@pytest.fixture
+def older_config(workplace: Workplace) -> Path:
+    """A config as version 0.1 wrote it: classes by the modules that they were in."""
+    config = yaml.safe_load(workplace.config.read_text())
+    config["model"]["class_path"] = "lightning_pose.models.surf_lstm.SurfLSTM"
+    config["data"]["class_path"] = "lightning_pose.data.datamodules.ImageDataModule"
+    config["data"]["init_args"]["extractor"] = {
+        "class_path": "lightning_pose.features.classical.SIFT",
+        "init_args": {"n_features": 8},
+    }
+    config["trainer"]["logger"] = {"class_path": "lightning_pose.tracking.MLflowLogger"}
+    file = workplace.folder / "older.yaml"
+    file.write_text(yaml.safe_dump(config))
+    return file
+
+
+def test_an_older_config_trains(workplace: Workplace, older_config: Path) -> None:
+    assert workplace.command("fit", "--config", older_config) == 0
+    assert workplace.runs()[0].info.status == "FINISHED"
+
+
+@pytest.mark.parametrize("joint", [" ", "="])
+def test_older_class_paths_on_the_command_line(workplace: Workplace, joint: str) -> None:
+    words = [
+        "--data=lightning_pose.data.datamodules.ImageDataModule".replace("=", joint),
+        "--data.extractor=lightning_pose.features.classical.ORB".replace("=", joint),
+    ]
+    cli = PoseCLI(["--config", str(workplace.config), *" ".join(words).split()], run=False)
+    assert type(cli.datamodule) is ImageDataModule
+    assert cli.config.data.init_args.extractor.class_path == "lightning_pose.features.ORB"
+
+
+def test_a_sweep_reads_an_older_base_config(older_config: Path) -> None:
+    _, _, config = resolve(older_config, {"model.units": 4})
+    assert config["data"]["class_path"] == "lightning_pose.data.ImageDataModule"
+    assert config["data"]["init_args"]["extractor"]["class_path"] == "lightning_pose.features.SIFT"
+    assert config["model"]["class_path"] == "lightning_pose.models.SurfLSTM"
