@@ -18,7 +18,7 @@ from lightning.pytorch.callbacks import Timer
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
-from lightning_pose.checkpoint import read_checkpoint, resolve_class_paths
+from lightning_pose.checkpoint import read_checkpoint, resolve_class_path, resolve_class_paths
 from lightning_pose.errors import CheckpointError, ConfigError
 from lightning_pose.evaluation.callback import TestReport
 from lightning_pose.localization.sequences import chain_test
@@ -48,6 +48,12 @@ def load_with_renames(text: str) -> Any:
 set_loader(PARSER_MODE, load_with_renames, exceptions=(yaml.YAMLError,))
 
 
+def _rename_value(word: str) -> str:
+    """A word of the command line, `VALUE` or `--NAME=VALUE`, an older class path in it replaced by today's."""
+    name, equals, value = word.rpartition("=")
+    return f"{name}{equals}{resolve_class_path(value)}"
+
+
 class PoseParser(LightningArgumentParser):
     """A parser that reads older class paths by today's, and raises ConfigError for a wrong setting.
 
@@ -56,7 +62,7 @@ class PoseParser(LightningArgumentParser):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         # jsonargparse makes parsers of this class for nested settings too, with the mode of the outer parser.
-        settings = {"formatter_class": _HelpFormatter} | kwargs | {"parser_mode": PARSER_MODE}
+        settings: dict[str, Any] = {"formatter_class": _HelpFormatter, **kwargs, "parser_mode": PARSER_MODE}
         super().__init__(*args, **settings)
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
@@ -173,7 +179,8 @@ class PoseCLI(LightningCLI):
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
         try:
-            self.config = parser.parse_args(args)  # Lightning's own warns that sys.argv is given as well
+            # Not Lightning's own, which warns that sys.argv is given as well.
+            self.config = parser.parse_args([_rename_value(word) for word in args])
         except UnicodeDecodeError as error:
             raise ConfigError(f"the config is not text ({error}); give a YAML file") from error
 
