@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lightning_pose.reports.published_rows import add_published, published_systems
-from lightning_pose.reports.published_tables import FRAMES, SCENES
+from lightning_pose.reports.published_rows import FRAMES, SCENES, add_published, published_systems
 from lightning_pose.reports.table import Report
 from lightning_pose.scenes.combine import join_scenes
 from lightning_pose.scenes.scene import Frame, Scene
