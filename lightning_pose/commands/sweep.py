@@ -19,6 +19,7 @@ if TYPE_CHECKING:  # Optuna and Lightning take seconds, and `--help` does withou
     from mlflow import MlflowClient
     from optuna import Study
 
+    from lightning_pose.studies.figure_spec import FigureSpec
     from lightning_pose.sweeps.plan import Plan
     from lightning_pose.sweeps.workers import Job
 
@@ -82,6 +83,7 @@ def main(argv: list[str]) -> int:
     own, overrides = _split(argv)
     args = _parser().parse_args(own)
     # Only now, so that `--help` is there at once.
+    from lightning_pose.studies.figure_spec import parse_figure_spec
     from lightning_pose.sweeps.parent_run import close_parent, open_parent
     from lightning_pose.sweeps.plan import read_plan
     from lightning_pose.sweeps.storage import alone, shown
@@ -89,6 +91,7 @@ def main(argv: list[str]) -> int:
     from lightning_pose.sweeps.workers import Job
 
     plan = read_plan(args.file, overrides)
+    spec = parse_figure_spec(plan.figure, plan.measure, plan.space)  # checked before anything is trained
     name = args.study or f"{args.file.stem}-{plan.scene}"
     storage = open_storage(args.storage, plan.tracking[0])
     with alone(storage, name):
@@ -104,7 +107,7 @@ def main(argv: list[str]) -> int:
             total = waiting(study) if total is None else min(total, waiting(study))
         _run(study, plan, Job(plan, name, args.storage, parent), N_TRIALS if total is None else total, args.workers)
         client, parent = open_parent(study, plan)  # another one, if someone has deleted it meanwhile
-        _conclude(study, plan, client, parent, args.out or Path("mlruns") / "sweeps" / name)
+        _conclude(study, plan, spec, client, parent, args.out or Path("mlruns") / "sweeps" / name)
         status = "FINISHED"
     except KeyboardInterrupt as stop:
         raise KeyboardInterrupt("the same command goes on") from stop
@@ -156,7 +159,9 @@ def _best_so_far(study: Study, plan: Plan) -> str:
     return "best " + ", ".join(f"{o.metric} {value:.4g}" for o, value in pairs) + f" (trial {best.number})"
 
 
-def _conclude(study: Study, plan: Plan, client: MlflowClient, parent: str, folder: Path) -> None:
+def _conclude(
+    study: Study, plan: Plan, spec: FigureSpec | None, client: MlflowClient, parent: str, folder: Path
+) -> None:
     """Print the best trials, and keep their config and figures in a folder and in the study's run."""
     from lightning_pose.runs.tags import REASON
     from lightning_pose.studies.result import show_study
@@ -182,12 +187,12 @@ def _conclude(study: Study, plan: Plan, client: MlflowClient, parent: str, folde
         for objective, value in zip(plan.objectives, best.values, strict=True):
             client.log_metric(parent, f"best/{objective.metric}", value)
     describe_parent(client, parent, study, plan)
-    if plan.measure is None or plan.exhibit is None:
+    if plan.measure is None or spec is None:
         sheet(study, plan).show()
     if plan.measure is None:  # a study has a figure of its own
         for file in draw_figures(study, plan, folder):
             client.log_artifact(parent, str(file), "figures")
-    files, rows = show_study(study, plan, folder)
+    files, rows = show_study(study, plan, spec, folder)
     for file in files:
         client.log_artifact(parent, str(file), "study")
     if rows is not None:

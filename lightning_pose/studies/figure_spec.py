@@ -9,7 +9,7 @@ from typing import Any
 from lightning_pose.errors import ConfigError
 from lightning_pose.sweeps.space import BASE, MEASURES, Parameter, nearest
 
-__all__ = ["Exhibit", "parse_exhibit"]
+__all__ = ["FigureSpec", "parse_figure_spec"]
 
 
 KINDS = ("line", "bar", "curve", "pictures")
@@ -18,7 +18,7 @@ ERRORS = ("position_median_m", "orientation_median_deg")
 
 
 @dataclass(frozen=True)
-class Exhibit:
+class FigureSpec:
     """A figure and a table.
 
     Attributes:
@@ -47,7 +47,7 @@ class Exhibit:
         return self.labels.get(name) or _spelt(name)
 
 
-def parse_exhibit(raw: Any, measure: str | None, space: Sequence[Parameter]) -> Exhibit | None:
+def parse_figure_spec(raw: Any, measure: str | None, space: Sequence[Parameter]) -> FigureSpec | None:
     """Read the `figure` of a sweep file; None where there is none.
 
     Raises:
@@ -76,7 +76,7 @@ def parse_exhibit(raw: Any, measure: str | None, space: Sequence[Parameter]) -> 
     log = _names(raw.get("log", []), "log")
     if not set(log) <= {"x", "y"}:
         raise ConfigError(f"figure.log is {list(log)}; give [x], [y] or [x, y]")
-    return Exhibit(
+    return FigureSpec(
         kind=kind,
         x=_axis(raw.get("x"), kind, space),
         y=y,

@@ -14,7 +14,7 @@ from optuna import Study
 from optuna.trial import FrozenTrial, TrialState
 
 from lightning_pose.runs.tags import CURVES, METRICS, REASON
-from lightning_pose.studies.figure_spec import Exhibit
+from lightning_pose.studies.figure_spec import FigureSpec
 from lightning_pose.sweeps.plan import Plan
 from lightning_pose.sweeps.space import SCENE, SEED
 from lightning_pose.terminal import Sheet
@@ -127,20 +127,18 @@ def varying(cells: Iterable[Cell]) -> list[str]:
     return [key for key in keys if len({str(cell.values[key]) for cell in cells if key in cell.values}) > 1]
 
 
-def _rows(cells: Sequence[Cell], exhibit: Exhibit) -> tuple[list[str], list[list[str]]]:
+def _rows(cells: Sequence[Cell], spec: FigureSpec) -> tuple[list[str], list[list[str]]]:
     keys = varying(cells) or list(dict.fromkeys(key for cell in cells for key in cell.values))
     several = any(len(cell.metrics) > 1 for cell in cells)
-    heads = (
-        [exhibit.label(key) for key in keys] + ["trials"] * several + [exhibit.label(name) for name in exhibit.table]
-    )
+    heads = [spec.label(key) for key in keys] + ["trials"] * several + [spec.label(name) for name in spec.table]
     rows = []
     for cell in cells:
         row = [cell.names.get(key, "") for key in keys]
         row += [str(len(cell.metrics))] * several
-        if cell.reason is not None and exhibit.table:
-            row += [f"failed: {cell.reason}"] + [""] * (len(exhibit.table) - 1)
+        if cell.reason is not None and spec.table:
+            row += [f"failed: {cell.reason}"] + [""] * (len(spec.table) - 1)
         else:
-            row += [_number(cell.all(metric)) for metric in exhibit.table]
+            row += [_number(cell.all(metric)) for metric in spec.table]
         rows.append(row)
     return heads, rows
 
@@ -157,14 +155,14 @@ def _short(value: float) -> str:
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
 
 
-def as_sheet(cells: Sequence[Cell], exhibit: Exhibit, title: str) -> Sheet:
+def as_sheet(cells: Sequence[Cell], spec: FigureSpec, title: str) -> Sheet:
     """For the terminal."""
-    return Sheet(title, *_rows(cells, exhibit))
+    return Sheet(title, *_rows(cells, spec))
 
 
-def as_markdown(cells: Sequence[Cell], exhibit: Exhibit) -> str:
+def as_markdown(cells: Sequence[Cell], spec: FigureSpec) -> str:
     """A GitHub table."""
-    heads, rows = _rows(cells, exhibit)
+    heads, rows = _rows(cells, spec)
     lines = [heads, ["---"] * len(heads), *rows]
     return "".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |\n" for line in lines)
 

@@ -12,9 +12,10 @@ import yaml
 
 from lightning_pose.cli import PoseCLI
 from lightning_pose.errors import ConfigError
+from lightning_pose.features import LocalExtractor
 from lightning_pose.sweeps.space import nearest
 
-__all__ = ["ParsedConfig", "check_known", "keys", "options", "put", "read_yaml", "resolve"]
+__all__ = ["ParsedConfig", "check_known", "keys", "open_keypoint_data", "options", "put", "read_yaml", "resolve"]
 
 
 class ParsedConfig(PoseCLI):
@@ -32,6 +33,21 @@ class ParsedConfig(PoseCLI):
     def parse(self, args: list[str]) -> dict[str, Any]:
         """Another command line's whole config, without the time that a new parser takes."""
         return self.parser.parse_args(args).as_dict()
+
+
+def open_keypoint_data(config: ParsedConfig) -> tuple[Any, list[Path]]:
+    """Build a config's data module; its model and trainer are not built.
+
+    Returns:
+        The data module, whose extractor is a `LocalExtractor`, and the files of the training frames.
+
+    Raises:
+        ConfigError: the extractor finds no keypoints.
+    """
+    data = config.parser.instantiate_classes(config.config)["data"]
+    if not isinstance(data.extractor, LocalExtractor):
+        raise ConfigError(f"{data.extractor.name} finds no keypoints; give an extractor that does, such as SURF")
+    return data, [Path(data.scene.frames[i].image) for i in data.scene.splits["train"]]
 
 
 def read_yaml(file: Path, what: str) -> dict[str, Any]:

@@ -13,7 +13,6 @@ import numpy as np
 from lightning_pose.errors import ConfigError
 from lightning_pose.metrics.summary import summarize_errors
 from lightning_pose.paths import default_tracking_uri
-from lightning_pose.studies.figure_spec import Exhibit, parse_exhibit
 from lightning_pose.sweeps.base_config import ParsedConfig, check_known, keys, options, put, read_yaml, resolve
 from lightning_pose.sweeps.space import BASE, MEASURES, Parameter, by_class_path, check_when, nearest, parse_space
 
@@ -50,7 +49,7 @@ class Plan:
         space: what is searched.
         measure: `test` where trials measure the test frames too, which choose nothing; `features` where they measure
             features and train nothing; else None.
-        exhibit: the figure and table that the study ends in, if any.
+        figure: the file's `figure` entry as it is written, None where there is none; `studies.figure_spec` reads it.
         resolved: the first base's whole config with `settings`, defaults included.
     """
 
@@ -64,7 +63,7 @@ class Plan:
     settings: Mapping[str, Any]
     space: tuple[Parameter, ...]
     measure: str | None
-    exhibit: Exhibit | None
+    figure: Any
     resolved: Mapping[str, Any]
 
     @property
@@ -160,7 +159,7 @@ def read_plan(file: Path, overrides: Mapping[str, Any]) -> Plan:
         settings=settings,
         space=tuple(space),
         measure=measure,
-        exhibit=parse_exhibit(raw.get("figure"), measure, space),
+        figure=raw.get("figure"),
         resolved=resolved,
     )
     weighed = [p.key for p in space if p.key.startswith("model.loss")] + [BASE] * (not alike)

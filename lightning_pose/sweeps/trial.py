@@ -22,12 +22,12 @@ from lightning_pose.cli import PoseCLI
 from lightning_pose.errors import ConfigError, PoseError
 from lightning_pose.evaluation.callback import TestReport
 from lightning_pose.evaluation.costs import costs
+from lightning_pose.features.keypoint_statistics import measure_keypoints
 from lightning_pose.models.parts.ridge import shared_factors
 from lightning_pose.runs.checkpoints import BestCheckpoint, checkpoint_folder, run_logger
 from lightning_pose.runs.process import process_tags
 from lightning_pose.runs.tags import CURVES, METRICS, PARENT_TAG, REASON, RUN
-from lightning_pose.sweeps.base_config import ParsedConfig
-from lightning_pose.sweeps.keypoint_statistics import measure_features
+from lightning_pose.sweeps.base_config import ParsedConfig, open_keypoint_data
 from lightning_pose.sweeps.plan import Plan
 from lightning_pose.sweeps.space import draw
 
@@ -216,7 +216,8 @@ def _fit(trial: Trial, plan: Plan, args: list[str], client: MlflowClient, run: s
 def _features(
     trial: Trial, plan: Plan, values: Mapping[str, Any], client: MlflowClient, run: str
 ) -> float | list[float]:
-    metrics, curves = measure_features(ParsedConfig(plan.arguments(values)))
+    data, images = open_keypoint_data(ParsedConfig(plan.arguments(values)))
+    metrics, curves = measure_keypoints(data.cache, images, data.extractor.n_features)
     for name, value in metrics.items():
         client.log_metric(run, name, value)
     for name, curve in curves.items():

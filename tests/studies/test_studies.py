@@ -17,7 +17,7 @@ import yaml
 from lightning_pose.errors import ConfigError
 from lightning_pose.features.base import Record
 from lightning_pose.studies.figure import draw_cells
-from lightning_pose.studies.figure_spec import Exhibit, parse_exhibit
+from lightning_pose.studies.figure_spec import FigureSpec, parse_figure_spec
 from lightning_pose.studies.table import Cell, as_markdown, named, varying
 from lightning_pose.sweeps.plan import Plan, read_plan
 from lightning_pose.sweeps.space import parse_space
@@ -175,6 +175,12 @@ def test_the_command_line_narrows_a_study(study: Study) -> None:
     assert searched(space__model__layers=[1, 2])["model.layers"] == [1, 2]
 
 
+def check_file(file: Path) -> None:
+    """Check a sweep file as the verb does before anything is trained."""
+    plan = read_plan(file, {})
+    parse_figure_spec(plan.figure, plan.measure, plan.space)
+
+
 @pytest.mark.parametrize(
     ("entries", "message"),
     [
@@ -196,11 +202,11 @@ def test_the_command_line_narrows_a_study(study: Study) -> None:
 )
 def test_a_study_that_cannot_be_is_refused(entries: dict[str, Any], message: str, study: Study) -> None:
     with pytest.raises(ConfigError, match=message):
-        read_plan(study(**entries), {})
+        check_file(study(**entries))
 
 
-def exhibit(x: str = "model.units", **entries: Any) -> Exhibit:
-    made = parse_exhibit({"x": x, **entries}, "test", parse_space({x: [1, 2], "model.cell": ["gru"]}))
+def figure_spec(x: str = "model.units", **entries: Any) -> FigureSpec:
+    made = parse_figure_spec({"x": x, **entries}, "test", parse_space({x: [1, 2], "model.cell": ["gru"]}))
     assert made is not None
     return made
 
@@ -219,7 +225,7 @@ def test_a_table_has_means_and_their_range() -> None:
         Cell({"model.units": 3, "model.cell": "gru"}, reason="no | such"),
     ]
     assert varying(cells) == ["model.units"]
-    assert as_markdown(cells, exhibit(y=TEST)).splitlines() == [
+    assert as_markdown(cells, figure_spec(y=TEST)).splitlines() == [
         "| units | trials | median position error (m) |",
         "| --- | --- | --- |",
         "| 1 | 2 | 0.2 (0.1 to 0.3) |",
@@ -235,14 +241,14 @@ def test_a_figure_has_a_line_for_each_other_setting() -> None:
         for cell, scale in (("gru", 0.1), ("rnn", 0.2))
         for units in (1, 2, 4)
     ]
-    (axes,) = draw_cells(cells, exhibit(y=TEST, beside=["oracle"]), "title").axes
+    (axes,) = draw_cells(cells, figure_spec(y=TEST, beside=["oracle"]), "title").axes
     drawn = {line.get_label(): np.asarray(line.get_xydata()).tolist() for line in axes.get_lines()}
     assert drawn == {
         "gru": [[1, 0.1], [2, 0.2], [4, pytest.approx(0.4)]],
         "rnn": [[1, 0.2], [2, 0.4], [4, pytest.approx(0.8)]],
         "oracle": [[1, 0.05], [2, 0.05], [4, 0.05]],
     }
-    (axes,) = draw_cells(cells, exhibit(y=TEST, kind="bar"), "title").axes
+    (axes,) = draw_cells(cells, figure_spec(y=TEST, kind="bar"), "title").axes
     heights = sorted(round(bar.get_height(), 6) for bar in axes.patches)  # type: ignore[attr-defined]
     assert heights == [0.1, 0.2, 0.2, 0.4, 0.4, 0.8]
     assert [text.get_text() for text in axes.get_xticklabels()] == ["1", "2", "4"]
@@ -251,7 +257,7 @@ def test_a_figure_has_a_line_for_each_other_setting() -> None:
 @pytest.mark.parametrize("kind", ["line", "bar"])
 def test_logarithmic_axes_hold_what_is_drawn(kind: str) -> None:
     cells = [Cell({"model.units": units, "model.cell": "gru"}, [{TEST: units**2 / 100}]) for units in (1, 10, 100)]
-    (axes,) = draw_cells(cells, exhibit(y=TEST, kind=kind, log=["x", "y"] if kind == "line" else ["y"]), "").axes
+    (axes,) = draw_cells(cells, figure_spec(y=TEST, kind=kind, log=["x", "y"] if kind == "line" else ["y"]), "").axes
     assert axes.get_yscale() == "log"
     low, high = axes.get_ylim()
     assert 0.005 < low < 0.01

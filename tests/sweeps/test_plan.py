@@ -11,6 +11,7 @@ import yaml
 
 from lightning_pose.commands.sweep import _read_value
 from lightning_pose.errors import ConfigError
+from lightning_pose.studies.figure_spec import parse_figure_spec
 from lightning_pose.sweeps.base_config import ParsedConfig
 from lightning_pose.sweeps.plan import read_plan
 from tests.helpers import Workplace
@@ -87,6 +88,12 @@ def test_a_folder_of_digits_stays_a_folder(sweep: Write) -> None:
     assert plan.config({"model.units": 4})["data"]["init_args"]["root"] == "2024"
 
 
+def check_file(file: Path) -> None:
+    """Check a sweep file as the verb does before anything is trained."""
+    plan = read_plan(file, {})
+    parse_figure_spec(plan.figure, plan.measure, plan.space)
+
+
 @pytest.mark.parametrize(
     ("entries", "said"),
     [
@@ -99,4 +106,4 @@ def test_a_folder_of_digits_stays_a_folder(sweep: Write) -> None:
 )
 def test_a_malformed_entry_is_named(entries: dict[str, Any], said: str, sweep: Write) -> None:
     with pytest.raises(ConfigError, match=said):
-        read_plan(sweep(**entries), {})
+        check_file(sweep(**entries))
