@@ -31,6 +31,8 @@ _INPUT_SHAPES = {1: [32], 2: [20, 64], 3: [16, 3, 4]}
 
 CLIP_LENGTH = 4
 
+_SEEDS = {"train": 0, "val": 11, "test": 12}  # of the frames of each split
+
 _exported = [getattr(models, name) for name in models.__all__]
 ARCHITECTURES = [
     cls
@@ -86,20 +88,28 @@ def problem_for(model: PoseModule) -> LearnableProblem:
 
 
 class LearnableProblem(LightningDataModule):
-    """Frames whose features are the pose times a fixed random matrix, so that there is all to learn and no noise."""
+    """Frames whose features are the pose times a fixed random matrix, so that there is all to learn and no noise.
+
+    Validation and test frames follow the same rule, and no frame is in two splits: what is learnt from one split
+    differs from what is learnt from another.
+    """
 
     def __init__(self, input_shape: list[int], count: int = 24) -> None:
         super().__init__()
-        position_m, quat_wxyz = random_poses(count)
-        pose = torch.cat([position_m, quat_wxyz], dim=-1)
-        pose = (pose - pose.mean(0)) / pose.std(0)
+        poses = {split: random_poses(count, seed) for split, seed in _SEEDS.items()}
+        train = torch.cat(poses["train"], dim=-1)
         mix = torch.randn(7, math.prod(input_shape), generator=torch.Generator().manual_seed(1)) / 7**0.5
-        features = (pose @ mix).reshape(count, *input_shape)
-        self.data = PoseDataset(PoseBatch(features, position_m, quat_wxyz, torch.arange(count)))
+        self.splits = {}
+        for number, (split, (position_m, quat_wxyz)) in enumerate(poses.items()):
+            pose = (torch.cat([position_m, quat_wxyz], dim=-1) - train.mean(0)) / train.std(0)
+            features = (pose @ mix).reshape(count, *input_shape)
+            frame = torch.arange(count) + number * count
+            self.splits[split] = PoseDataset(PoseBatch(features, position_m, quat_wxyz, frame))
+        self.data = self.splits["train"]
         self.learnt = self.data.data
 
     def dataset(self, split: str) -> PoseDataset:
-        return self.data
+        return self.splits[split]
 
     def train_dataloader(self) -> DataLoader[PoseBatch]:
         return batch_loader(self.data, batch_size=8, shuffle=True)
@@ -113,8 +123,11 @@ class ClipProblem(LearnableProblem):
 
     def __init__(self, input_shape: list[int], count: int = 24) -> None:
         super().__init__(input_shape, count)
-        data = self.data.data
-        self.clips = ClipDataset(data, [np.arange(count)], ClipShape(CLIP_LENGTH, hop=1))
+        shape = ClipShape(CLIP_LENGTH, hop=1)
+        self.clip_splits = {
+            split: ClipDataset(frames.data, [np.arange(count)], shape) for split, frames in self.splits.items()
+        }
+        self.clips = self.clip_splits["train"]
         # What a frame shows is its pose relative to the first frame of its clip, as it is to be told.
         _, position_m, quat_wxyz, frame = self.clips.__getitems__(range(len(self.clips)))
         rows, columns = input_shape
@@ -125,7 +138,7 @@ class ClipProblem(LearnableProblem):
         self.learnt = PoseBatch(features, position_m, quat_wxyz, frame)
 
     def dataset(self, split: str) -> ClipDataset:  # type: ignore[override]
-        return self.clips
+        return self.clip_splits[split]
 
     def train_dataloader(self) -> DataLoader[PoseBatch]:
         return batch_loader(PoseDataset(self.learnt), batch_size=8, shuffle=True)
