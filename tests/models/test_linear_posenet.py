@@ -100,6 +100,7 @@ def test_refit_learns_from_the_validation_frames_too() -> None:
 
 def test_the_lambda_with_the_lowest_validation_loss_is_kept() -> None:
     problem = NoisyProblem()
+    problem.splits["test"].data.features.neg_()  # by these frames the strongest lambda would be best
     lambdas = [1e-3, 1.0, 30.0, 1e5]
     loss = LossConfig(form="split", orientation_weight=10.0, normalize_quat=True)
     chosen = fit(problem, lambdas=lambdas, refit=False, loss=loss)
