@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
+import threading
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -123,10 +125,36 @@ class MLflowLogger(MLFlowLogger):
         super().log_hyperparams({name: value for name, value in flat.items() if name not in known})
 
     @rank_zero_only
+    def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
+        """Log metrics; Ctrl-C takes effect once they are written."""
+        with _interrupts_delayed():
+            super().log_metrics(metrics, step)
+
+    @rank_zero_only
     def finalize(self, status: str = "success") -> None:
         """End the run: FINISHED, or `stopped_as` where Lightning says that it failed."""
         if self._initialized:
             self.client.set_terminated(str(self.run_id), self.stopped_as if status == "failed" else "FINISHED")
+
+
+@contextmanager
+def _interrupts_delayed() -> Iterator[None]:
+    """Ctrl-C within takes effect at the end.
+
+    A transaction that KeyboardInterrupt breaks off may keep SQLite locked for this process: the next write, which is
+    to close the run, waits 20 s and fails with "database is locked".
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield  # signals reach the main thread alone
+        return
+    pressed: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, frame: pressed.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.SIG_DFL if before is None else before)
+    if pressed:
+        signal.raise_signal(signal.SIGINT)
 
 
 @contextmanager

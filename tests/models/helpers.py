@@ -31,6 +31,8 @@ _INPUT_SHAPES = {1: [32], 2: [20, 64], 3: [16, 3, 4]}
 
 CLIP_LENGTH = 4
 
+_SEEDS = {"train": 0, "val": 11, "test": 12}  # of the frames of each split
+
 _exported = [getattr(models, name) for name in models.__all__]
 ARCHITECTURES = [
     cls
@@ -88,36 +90,29 @@ def problem_for(model: PoseModule) -> LearnableProblem:
 class LearnableProblem(LightningDataModule):
     """Frames whose features are the pose times a fixed random matrix, so that there is all to learn and no noise.
 
-    Each split has frames of its own, so that code which reads the test split while fitting gives other results.
+    Validation and test frames follow the same rule, and no frame is in two splits: what is learnt from one split
+    differs from what is learnt from another.
     """
 
     def __init__(self, input_shape: list[int], count: int = 24) -> None:
         super().__init__()
-        position_m, quat_wxyz = random_poses(count)
-        pose = torch.cat([position_m, quat_wxyz], dim=-1)
-        pose = (pose - pose.mean(0)) / pose.std(0)
+        poses = {split: random_poses(count, seed) for split, seed in _SEEDS.items()}
+        train = torch.cat(poses["train"], dim=-1)
         mix = torch.randn(7, math.prod(input_shape), generator=torch.Generator().manual_seed(1)) / 7**0.5
-        features = (pose @ mix).reshape(count, *input_shape)
-        self.data = PoseDataset(PoseBatch(features, position_m, quat_wxyz, torch.arange(count)))
+        self.splits = {}
+        for number, (split, (position_m, quat_wxyz)) in enumerate(poses.items()):
+            pose = (torch.cat([position_m, quat_wxyz], dim=-1) - train.mean(0)) / train.std(0)
+            features = (pose @ mix).reshape(count, *input_shape)
+            frame = torch.arange(count) + number * count
+            self.splits[split] = PoseDataset(PoseBatch(features, position_m, quat_wxyz, frame))
+        self.data = self.splits["train"]
         self.learnt = self.data.data
-        self.held_out = {
-            split: PoseDataset(_other_frames(mix, input_shape, pose_count=count // 2, seed=seed))
-            for split, seed in (("val", 21), ("test", 22))
-        }
 
     def dataset(self, split: str) -> PoseDataset:
-        return self.data if split == "train" else self.held_out[split]
+        return self.splits[split]
 
     def train_dataloader(self) -> DataLoader[PoseBatch]:
         return batch_loader(self.data, batch_size=8, shuffle=True)
-
-
-def _other_frames(mix: torch.Tensor, input_shape: list[int], pose_count: int, seed: int) -> PoseBatch:
-    """Frames of another split: other poses, and numbers that no training frame has."""
-    position_m, quat_wxyz = random_poses(pose_count, seed)
-    pose = torch.cat([position_m, quat_wxyz], dim=-1)
-    features = (pose @ mix).reshape(pose_count, *input_shape)
-    return PoseBatch(features, position_m, quat_wxyz, 1000 * seed + torch.arange(pose_count))
 
 
 class ClipProblem(LearnableProblem):
@@ -128,8 +123,11 @@ class ClipProblem(LearnableProblem):
 
     def __init__(self, input_shape: list[int], count: int = 24) -> None:
         super().__init__(input_shape, count)
-        data = self.data.data
-        self.clips = ClipDataset(data, [np.arange(count)], ClipShape(CLIP_LENGTH, hop=1))
+        shape = ClipShape(CLIP_LENGTH, hop=1)
+        self.clip_splits = {
+            split: ClipDataset(frames.data, [np.arange(count)], shape) for split, frames in self.splits.items()
+        }
+        self.clips = self.clip_splits["train"]
         # What a frame shows is its pose relative to the first frame of its clip, as it is to be told.
         _, position_m, quat_wxyz, frame = self.clips.__getitems__(range(len(self.clips)))
         rows, columns = input_shape
@@ -140,7 +138,7 @@ class ClipProblem(LearnableProblem):
         self.learnt = PoseBatch(features, position_m, quat_wxyz, frame)
 
     def dataset(self, split: str) -> ClipDataset:  # type: ignore[override]
-        return self.clips
+        return self.clip_splits[split]
 
     def train_dataloader(self) -> DataLoader[PoseBatch]:
         return batch_loader(PoseDataset(self.learnt), batch_size=8, shuffle=True)

@@ -11,12 +11,21 @@ import torch
 from lightning import Trainer
 
 from lightning_pose.checkpoint import build
-from lightning_pose.data.batches import PoseBatch
+from lightning_pose.data.batches import PoseBatch, batch_loader
 from lightning_pose.errors import ConfigError
 from lightning_pose.geometry.quaternions import orientation_error_deg, position_error_m
 from lightning_pose.losses import LossConfig
-from lightning_pose.models import CNN3D, ClipModule, PoseModule
-from tests.models.helpers import ARCHITECTURES, CLIP_LENGTH, features_for, make_model, problem_for, random_poses
+from lightning_pose.models import CNN3D, ClipModule, DensePoseNet, KernelPoseNet, LinearPoseNet, PoseModule
+from tests.models.helpers import (
+    ARCHITECTURES,
+    CLIP_LENGTH,
+    ClipProblem,
+    LearnableProblem,
+    features_for,
+    make_model,
+    problem_for,
+    random_poses,
+)
 
 Architecture = type[PoseModule]
 every_architecture = pytest.mark.parametrize("architecture", ARCHITECTURES, ids=lambda cls: cls.__name__)
@@ -118,3 +127,52 @@ def test_it_learns_what_can_be_learnt(architecture: Architecture) -> None:
     upright = torch.tensor([1.0, 0.0, 0.0, 0.0])
     turned = orientation_error_deg(upright, data.quat_wxyz).median()
     assert orientation_error_deg(quat_wxyz, data.quat_wxyz).median() < turned / 3
+
+
+class NoTestSplit:
+    """Refuses the test split of a data module, which nothing may read before the test."""
+
+    def dataset(self, split: str) -> Any:
+        assert split != "test", "the test split was read while fitting"
+        return super().dataset(split)  # type: ignore[misc]
+
+
+class LearnableWithoutTest(NoTestSplit, LearnableProblem):
+    def val_dataloader(self) -> Any:
+        return batch_loader(self.dataset("val"), batch_size=8, shuffle=False)
+
+
+class ClipsWithoutTest(NoTestSplit, ClipProblem):
+    def val_dataloader(self) -> Any:
+        return batch_loader(self.dataset("val"), batch_size=8, shuffle=False)
+
+
+CLOSED_FORMS: list[tuple[Architecture, dict[str, Any]]] = [
+    (LinearPoseNet, {"lambdas": [1.0, 10.0], "refit": True, "components": 4}),
+    (KernelPoseNet, {"lambdas": [0.1, 1.0], "refit": True}),
+    (DensePoseNet, {"components": 4}),
+]
+
+
+@pytest.mark.parametrize(("architecture", "settings"), [*((cls, {}) for cls in ARCHITECTURES), *CLOSED_FORMS], ids=str)
+def test_fitting_does_not_read_the_test_split(architecture: Architecture, settings: dict[str, Any]) -> None:
+    model = make_model(architecture, **settings)
+    problem = ClipsWithoutTest if isinstance(model, ClipModule) else LearnableWithoutTest
+    trainer = Trainer(
+        max_epochs=1,
+        accelerator="cpu",
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+    )
+    trainer.fit(model, datamodule=problem(list(model.input_shape)))
+    assert "val/loss" in trainer.callback_metrics
+
+
+@pytest.mark.parametrize("problem", [LearnableProblem([20, 5]), ClipProblem([20, 5])])
+def test_no_frame_of_a_problem_is_in_two_splits(problem: LearnableProblem) -> None:
+    data = [problem.splits[split].data for split in ("train", "val", "test")]
+    for tensors in zip(*data, strict=True):
+        rows = torch.cat([tensor.flatten(1) if tensor.ndim > 1 else tensor[:, None] for tensor in tensors])
+        assert len(rows.unique(dim=0)) == len(rows)

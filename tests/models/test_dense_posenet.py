@@ -21,6 +21,8 @@ def test_the_thesis_counts_its_parameters(components: int | None, count: int) ->
 
 def test_it_reads_principal_components_of_the_training_features() -> None:
     problem = LearnableProblem([32])
+    for data in problem.splits.values():
+        data.data.features.add_(torch.linspace(1, 2, 32))  # their mean is a component only if it is not taken away
     model = DensePoseNet(input_shape=[32], components=4, standardize_features=False)
     trainer = Trainer(max_epochs=1, accelerator="cpu", logger=False, enable_checkpointing=False,
                       enable_progress_bar=False, enable_model_summary=False)  # fmt: skip
@@ -35,6 +37,17 @@ def test_it_reads_principal_components_of_the_training_features() -> None:
     rebuilt = DensePoseNet(input_shape=[32], components=4, standardize_features=False)
     rebuilt.load_state_dict(model.state_dict())
     torch.testing.assert_close(rebuilt.eval()(features), model.eval()(features))
+
+
+def test_relu_follows_each_layer_but_the_last() -> None:
+    model = DensePoseNet(input_shape=[8], units=[6, 5])
+    features = torch.randn(20, 8, generator=torch.Generator().manual_seed(0))
+    linear = [module for module in model.network if isinstance(module, torch.nn.Linear)]  # type: ignore[union-attr]
+    expected = features
+    for layer in linear[:-1]:
+        expected = (expected @ layer.weight.T + layer.bias).clamp(min=0)
+    expected = expected @ linear[-1].weight.T + linear[-1].bias
+    torch.testing.assert_close(model.eval().network(features), expected)  # type: ignore[operator]
 
 
 def test_headline_names_what_differs() -> None:

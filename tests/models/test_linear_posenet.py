@@ -26,24 +26,20 @@ D = 16
 
 
 class NoisyProblem(LearnableProblem):
-    """Features that tell the pose through noise, with validation frames of their own."""
+    """Features that give the pose with noise; validation and test frames are others than those of training."""
 
     def __init__(self, count: int = 40, val: int = 12) -> None:
         super().__init__([D])
-        position_m, quat_wxyz = random_poses(count + val, seed=3)
+        parts = {"train": count, "val": val, "test": 12}
+        position_m, quat_wxyz = random_poses(sum(parts.values()), seed=3)
         generator = torch.Generator().manual_seed(5)
         pose = torch.cat([position_m, quat_wxyz], dim=-1)
-        features = pose @ torch.randn(7, D, generator=generator) + torch.randn(count + val, D, generator=generator)
-        whole = PoseBatch(features, position_m, quat_wxyz, torch.arange(count + val))
-        train, self.held = (PoseBatch(*parts) for parts in zip(*(t.split([count, val]) for t in whole), strict=True))
-        self.data = PoseDataset(train)
-        # Other frames under other noise: whatever learns from the test split while fitting is found out.
-        position_m, quat_wxyz = random_poses(count, seed=11)
-        strange = PoseBatch(torch.randn(count, D, generator=generator), position_m, quat_wxyz, torch.arange(count))
-        self.strange = PoseDataset(strange._replace(frame=strange.frame + count + val))
-
-    def dataset(self, split: str) -> PoseDataset:
-        return {"train": self.data, "val": PoseDataset(self.held), "test": self.strange}[split]
+        features = pose @ torch.randn(7, D, generator=generator)
+        features += torch.randn(features.shape, generator=generator)
+        whole = PoseBatch(features, position_m, quat_wxyz, torch.arange(len(features)))
+        cut = zip(*(tensor.split(list(parts.values())) for tensor in whole), strict=True)
+        self.splits = {split: PoseDataset(PoseBatch(*part)) for split, part in zip(parts, cut, strict=True)}
+        self.data, self.held = self.splits["train"], self.splits["val"].data
 
     def val_dataloader(self) -> DataLoader[PoseBatch] | list[Any]:
         return batch_loader(self.dataset("val"), batch_size=5, shuffle=False) if len(self.held.frame) else []
@@ -104,6 +100,7 @@ def test_refit_learns_from_the_validation_frames_too() -> None:
 
 def test_the_lambda_with_the_lowest_validation_loss_is_kept() -> None:
     problem = NoisyProblem()
+    problem.splits["test"].data.features.neg_()  # by these frames the strongest lambda would be best
     lambdas = [1e-3, 1.0, 30.0, 1e5]
     loss = LossConfig(form="split", orientation_weight=10.0, normalize_quat=True)
     chosen = fit(problem, lambdas=lambdas, refit=False, loss=loss)

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import torch
+from lightning import Trainer
 from torch import Tensor
 from torch_geometric.nn import GATConv, GCNConv, GraphConv
 
@@ -17,7 +18,7 @@ from lightning_pose.errors import CheckpointError, ConfigError
 from lightning_pose.geometry.quaternions import align_hemisphere, orientation_error_deg
 from lightning_pose.models import NodePose
 from lightning_pose.models.parts.neighbour_graph import edge_index, search_neighbours
-from tests.models.helpers import random_poses
+from tests.models.helpers import LearnableProblem, random_poses
 
 WIDTH = 16
 CONVOLUTIONS = ["wl", "gcn", "SAGEConv", "GATConv", "GATv2Conv", "TransformerConv"]
@@ -123,6 +124,18 @@ def test_memory_is_in_the_order_of_frames() -> None:
     queries = frames(5, seed=1).features
     torch.testing.assert_close(decode(shuffled, queries), decode(model, queries))
     assert torch.equal(shuffled.memory_frame, torch.arange(30))
+
+
+def test_memory_is_the_training_split() -> None:
+    problem = LearnableProblem([WIDTH])
+    model = NodePose(input_shape=[WIDTH], neighbours=3, channels=[12, 8])
+    Trainer(max_epochs=1, accelerator="cpu", logger=False, enable_checkpointing=False,
+            enable_progress_bar=False, enable_model_summary=False).fit(model, datamodule=problem)  # fmt: skip
+    assert torch.equal(model.memory_features, problem.data.data.features)
+    assert torch.equal(model.memory_frame, problem.data.data.frame)
+    torch.testing.assert_close(
+        model.memory_pose[:, :3] * model.pose_scale[:3] + model.pose_mean[:3], problem.data.data.position_m
+    )
 
 
 def test_frames_within_the_gap_are_not_joined() -> None:

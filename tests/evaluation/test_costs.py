@@ -1,0 +1,43 @@
+"""Measured times: the first call of a model, which allocates and compiles, is not among them."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from lightning import LightningModule, Trainer
+from torch import Tensor
+
+from lightning_pose.evaluation.costs import costs
+from tests.models.helpers import LearnableProblem
+
+
+class SlowAtFirst(LightningModule):
+    """A model whose first call takes 1 s of the test's clock, and every other 2 ms."""
+
+    def __init__(self, clock: Any) -> None:
+        super().__init__()
+        self.network = torch.nn.Linear(4, 7)
+        self.clock = clock
+        self.calls = 0
+
+    def forward(self, features: Tensor) -> Tensor:
+        self.clock.seconds += 0.002 if self.calls else 1.0
+        self.calls += 1
+        return self.network(features)
+
+
+def test_the_first_call_is_not_measured(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    clock = SimpleNamespace(seconds=0.0)
+    problem = LearnableProblem([4], count=2)  # of two frames the median is the mean, which a slow one would raise
+    trainer = Trainer(accelerator="cpu", logger=False, enable_checkpointing=False, default_root_dir=tmp_path)
+    trainer.datamodule = problem  # type: ignore[attr-defined]
+    model = SlowAtFirst(clock)
+    monkeypatch.setattr(time, "perf_counter", lambda: clock.seconds)
+    found = costs(trainer, model, features=False)
+    assert found["cost/ms_per_frame"] == pytest.approx(2.0)
+    assert model.calls == 3
