@@ -17,9 +17,9 @@ __all__ = ["SurfCNN"]
 class SurfCNN(PoseModule):
     """Convolutions over (N, D) descriptors, strongest first, seen as an image of one channel.
 
-    Table 2.1 of the thesis. It pools after every convolution, which would empty a 64-wide input twice over: here
-    the first three pools are 2x2 and the rest 1x2, along the descriptor, in ceil mode, which gives table 2.2's
-    parameter counts. Each convolution is followed by ReLU, batch normalisation and its pool.
+    Table 2.1 of the thesis. It pools after every convolution. The descriptor's 64 elements can be halved that often;
+    the N features cannot, or table 2.2's parameter counts are not met. So the first three pools are 2x2 and the last
+    two 1x2, along the descriptor, in ceil mode. Each convolution is followed by ReLU, batch normalisation and its pool.
 
     The order by strength changes from frame to frame. With `ordered` off, kernels, strides and pools reach along
     each descriptor alone, and the maps are averaged over the features, so that their order does not matter.
