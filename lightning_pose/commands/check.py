@@ -18,15 +18,15 @@ from lightning_pose.commands.parser import VerbParser
 from lightning_pose.scenes.formats import known_formats, load_scene
 from lightning_pose.scenes.inspect import (
     ImageFile,
-    _angle_deg,
-    _counted,
-    _positions,
-    _quats,
-    _read_file,
-    _split_of,
-    _steps,
+    find_angle_deg,
+    format_counts,
     inspect_images,
     inspect_poses,
+    map_frames_to_splits,
+    measure_steps,
+    read_image_file,
+    stack_positions,
+    stack_quats,
 )
 from lightning_pose.scenes.scene import SPLITS, Scene
 
@@ -61,7 +61,7 @@ def main(argv: list[str]) -> int:
 def _read_files(scene: Scene, console: Console) -> list[ImageFile]:
     images = [frame.image for frame in scene.frames]
     with ThreadPoolExecutor() as pool:  # OpenCV and hashlib let other threads run meanwhile
-        files = pool.map(_read_file, images)
+        files = pool.map(read_image_file, images)
         return list(track(files, "reading images", total=len(images), console=console, transient=True))
 
 
@@ -77,21 +77,21 @@ def _facts(scene: Scene, files: list[ImageFile]) -> Iterator[tuple[str, str]]:
     yield "format", f"{scene.format}, ground truth {scene.ground_truth}"
     sizes = {split: len(scene.splits[split]) for split in SPLITS}
     yield f"split ({scene.split_source})", ", ".join(f"{split} {size}" for split, size in sizes.items())
-    yield "image size", _counted(Counter(file.size for file in files if file.size)) or "none can be read"
+    yield "image size", format_counts(Counter(file.size for file in files if file.size)) or "none can be read"
     camera = scene.frames[0].intrinsics
     yield "intrinsics", "unknown" if camera is None else f"f {camera.fx:g} {camera.fy:g}, c {camera.cx:g} {camera.cy:g}"
-    positions = _positions(scene)
+    positions = stack_positions(scene)
     yield "extent", " x ".join(f"{side:.2f}" for side in np.ptp(positions, axis=0)) + f" {scene.unit}"
-    step, angle_deg, _ = _steps(scene)
+    step, angle_deg, _ = measure_steps(scene)
     if len(step):
         yield "frame spacing", f"median {np.median(step):.3g} {scene.unit}, {np.median(angle_deg):.3g} deg"
-    quats = _quats(scene)
-    from_mean = _angle_deg(Rotation.from_quat(quats, scalar_first=True).mean().as_quat(scalar_first=True), quats)
+    quats = stack_quats(scene)
+    from_mean = find_angle_deg(Rotation.from_quat(quats, scalar_first=True).mean().as_quat(scalar_first=True), quats)
     yield "rotation", f"up to {from_mean.max():.0f} deg from the mean, median {np.median(from_mean):.0f} deg"
     train, test = scene.splits["train"], scene.splits["test"]
     if len(train) and len(test):
         distance, nearest = KDTree(positions[train]).query(positions[test])
-        angle = _angle_deg(quats[test], quats[train[nearest]])
+        angle = find_angle_deg(quats[test], quats[train[nearest]])
         yield (
             "test to nearest training pose",
             f"median {np.median(distance):.3g} {scene.unit}, {np.median(angle):.3g} deg; "
@@ -103,7 +103,7 @@ def _sequences(scene: Scene) -> Table:
     table = Table("sequence")
     for name in (*SPLITS, "first", "last"):
         table.add_column(name, justify="right")
-    split_of = _split_of(scene)
+    split_of = map_frames_to_splits(scene)
     for sequence in dict.fromkeys(frame.sequence for frame in scene.frames):
         rows = [i for i, frame in enumerate(scene.frames) if frame.sequence == sequence]
         counts = Counter(split_of[i] for i in rows)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from pathlib import Path
 
 from lightning_pose.commands.parser import VerbParser
 from lightning_pose.errors import ConfigError
+from lightning_pose.paths import default_tracking_uri
 from lightning_pose.reports.choose_run import PICKS
 
 __all__ = ["main"]
@@ -74,8 +74,7 @@ def main(argv: list[str]) -> int:
         trials=args.trials,
     )
     form = args.format or _form_of(args.out)
-    # As `tracking.default_tracking_uri` says, which Lightning comes with.
-    uri = args.tracking_uri or os.environ.get("MLFLOW_TRACKING_URI") or "sqlite:///mlruns/mlflow.db"
+    uri = args.tracking_uri or default_tracking_uri()
     runs, notes = select_runs(read_runs(uri), filters)
     report = build_report(runs, args.pick, tuple(dict.fromkeys(args.by)))
     report.notes += notes

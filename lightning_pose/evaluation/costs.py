@@ -11,7 +11,8 @@ import torch
 from lightning import LightningModule, Trainer
 from torch import nn
 
-from lightning_pose.runs.recorder import checkpoint_folder, train_seconds
+from lightning_pose.runs.checkpoints import checkpoint_folder
+from lightning_pose.runs.recorder import train_seconds
 
 __all__ = ["costs", "count_layers"]
 

@@ -9,14 +9,11 @@ from torch.nn import functional as F
 
 from lightning_pose.errors import ConfigError
 
-__all__ = ["CHUNK", "VLAD_CENTRES", "VLAD_SAMPLE", "global_vectors", "nearest"]
-
+__all__ = ["global_vectors", "nearest"]
 
 VLAD_CENTRES = 64
 
-
 VLAD_SAMPLE = 50_000
-
 
 CHUNK = 256
 

@@ -1,7 +1,7 @@
 """The figures of systems that take clips: their trajectories, errors by clip length, cost by features, responses.
 
-As in `plots`, each function returns a matplotlib `Figure` and touches neither pyplot, nor a display, nor the disk;
-the model is blue and the truth black.
+As in `figures.images`, each function returns a matplotlib `Figure` and touches neither pyplot, nor a display, nor the
+disk; the model is blue and the truth black.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def relative_trajectories(
         prediction: sequence to (M, 3), in the same axes.
         title: the heading.
         unit: unit of the positions and of the errors.
-        errors: sequence to its position error, told in the panel's title unless it is NaN.
+        errors: sequence to its position error, shown in the panel's title unless it is NaN.
     """
     names = list(truth)[:PANELS]
     columns = max(1, math.ceil(math.sqrt(len(names))))

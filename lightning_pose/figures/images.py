@@ -1,8 +1,8 @@
 """The figures of a run: where it went, how often it is how wrong, and what its errors depend on.
 
 Each function returns a matplotlib `Figure` and touches neither pyplot, nor a display, nor the disk. The
-model is blue and the truth black throughout; baselines keep their own colour (Okabe & Ito's palette, told
-apart by the colour-blind) and dash.
+model is blue and the truth black throughout; baselines keep their own colour (Okabe & Ito's palette, which
+the colour-blind can distinguish) and dash.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from lightning_pose.figures.style import (
     TRAINING,
     TRUTH,
     Errors,
-    _infinite,
-    _log_limits,
+    find_log_limits,
     log_axis,
     longest_axes,
+    nan_to_infinity,
 )
 
 __all__ = ["cumulative_errors", "error_vs_distance", "trajectory"]
@@ -104,7 +104,7 @@ def cumulative_errors(
 ) -> Figure:
     """How many frames are within each position error, and within each orientation error; higher is better.
 
-    The legends tell the medians, worst last. NaN counts as infinite, so a curve may end below 100 %.
+    The legends show the medians, worst last. NaN counts as infinite, so a curve may end below 100 %.
 
     Args:
         model: the model's errors.
@@ -122,9 +122,9 @@ def cumulative_errors(
         (panels[0], 0, f"position error ({unit})", f" {unit}"),
         (panels[1], 1, "orientation error (°)", "°"),
     ):
-        curves = {other: np.sort(_infinite(errors[column])) for other, errors in baselines.items()}
-        curves[name] = np.sort(_infinite(model[column]))
-        limits = _log_limits(np.concatenate(list(curves.values())))
+        curves = {other: np.sort(nan_to_infinity(errors[column])) for other, errors in baselines.items()}
+        curves[name] = np.sort(nan_to_infinity(model[column]))
+        limits = find_log_limits(np.concatenate(list(curves.values())))
         for zorder, (curve, errors) in enumerate(curves.items(), start=2):
             color, dash = looks[curve]
             x = np.concatenate([[limits[0]], np.minimum(errors, 2 * limits[1])])
@@ -160,10 +160,10 @@ def error_vs_distance(
         title: the heading.
         unit: unit of both.
     """
-    error, distance = _infinite(position_error_m), np.asarray(distance_m, float)
+    error, distance = nan_to_infinity(position_error_m), np.asarray(distance_m, float)
     finite = np.isfinite(error)
     error, distance = np.maximum(error[finite], SMALLEST), np.maximum(distance[finite], SMALLEST)
-    limits = _log_limits(np.concatenate([error, distance]))
+    limits = find_log_limits(np.concatenate([error, distance]))
     figure = Figure(figsize=(6, 6), dpi=150, layout="constrained")
     axes = figure.add_subplot(title=title)
     color, dash = BASELINES["oracle"]

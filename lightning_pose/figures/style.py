@@ -22,13 +22,10 @@ __all__ = [
     "longest_axes",
 ]
 
-
 Errors = tuple[ArrayLike, ArrayLike]
 """Position errors (N,) in the scene's unit, and orientation errors (N,) in degrees."""
 
-
 MODEL, TRUTH, TRAINING = "#0072B2", "#1a1a1a", "#c4c4c4"
-
 
 BASELINES = {
     "train_mean": ("#8c8c8c", (0, (1, 1.5))),
@@ -37,12 +34,9 @@ BASELINES = {
     "oracle": ("#009E73", (0, (5, 1.5, 1, 1.5))),
 }
 
-
 OTHERS = [("#CC79A7", (0, (5, 1.5))), ("#56B4E9", (0, (3, 1.5))), ("#882255", (0, (1, 1)))]
 
-
 SMALLEST = 1e-4  # a tenth of a millimetre, or its like in degrees: zero has no place on a logarithmic axis
-
 
 STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
@@ -73,12 +67,12 @@ def longest_axes(truth_m: np.ndarray) -> list[int]:
     return sorted(int(axis) for axis in np.argsort(-np.ptp(truth_m, axis=0), kind="stable")[:2])
 
 
-def _infinite(errors: ArrayLike) -> np.ndarray:
+def nan_to_infinity(errors: ArrayLike) -> np.ndarray:
     values = np.asarray(errors, float)
     return np.where(np.isnan(values), np.inf, values)
 
 
-def _log_limits(errors: np.ndarray) -> tuple[float, float]:
+def find_log_limits(errors: np.ndarray) -> tuple[float, float]:
     """Limits that hold all finite errors but the smallest hundredth, which would stretch a logarithmic axis."""
     finite = np.maximum(errors[np.isfinite(errors)], SMALLEST)
     if not len(finite):

@@ -11,9 +11,7 @@ from lightning_pose.geometry.quaternions import matrix_to_quat
 
 __all__ = ["INLIER_PX", "MIN_INLIERS", "two_view_motion"]
 
-
 INLIER_PX = 1.0
-
 
 MIN_INLIERS = 12
 """With fewer, the motion is a guess. Of frames of an office half a second apart, 20 degrees turned, 8 or 9 inliers gave

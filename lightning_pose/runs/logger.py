@@ -18,7 +18,7 @@ from lightning.pytorch.loggers import MLFlowLogger
 
 from lightning_pose.errors import CheckpointError
 from lightning_pose.paths import STORE_VARIABLE, default_tracking_uri
-from lightning_pose.runs.process import _process_has_died, process_tags
+from lightning_pose.runs.process import has_owner_died, process_tags
 from lightning_pose.runs.tags import PARENT_TAG
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ class MLflowLogger(MLFlowLogger):
         client = self.experiment
         if not self._claimed:
             self._claimed = True
-            # A run that goes on belongs to this process now; the tags of the dead one would have it closed.
+            # A run that goes on belongs to this process now; with the tags of the ended one it would be closed.
             for name, value in process_tags().items():
                 client.set_tag(str(self.run_id), name, value)
             self._close_stale_runs(client)
@@ -106,12 +106,12 @@ class MLflowLogger(MLFlowLogger):
         return self._tracking_uri
 
     def _close_stale_runs(self, client: MlflowClient) -> None:
-        """Mark runs of this machine whose process is gone: nothing could mark them when they died.
+        """Mark runs of this machine whose process is gone: nothing could mark them when it ended.
 
-        A sweep's run has the process of whichever command came last, and lives as long as one of its trials does.
+        A sweep's run names the process of the last command; it stays open while one of its trials runs.
         """
         running = client.search_runs([str(self.experiment_id)], "attributes.status = 'RUNNING'")
-        dead = [run for run in running if run.info.run_id != self.run_id and _process_has_died(run)]
+        dead = [run for run in running if run.info.run_id != self.run_id and has_owner_died(run)]
         closed = {run.info.run_id for run in dead}
         held = {run.data.tags.get(PARENT_TAG) for run in running if run.info.run_id not in closed}
         for run_id in closed - held:
@@ -159,7 +159,7 @@ def _interrupts_delayed() -> Iterator[None]:
 
 @contextmanager
 def _environment_kept() -> Iterator[None]:
-    """MLflow writes the store that it is told into `MLFLOW_TRACKING_URI`, where the next logger would read it."""
+    """MLflow writes the address of its store into `MLFLOW_TRACKING_URI`, where the next logger would read it."""
     before = os.environ.get(STORE_VARIABLE)
     try:
         yield

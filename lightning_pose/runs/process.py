@@ -16,13 +16,12 @@ if TYPE_CHECKING:
 
 __all__ = ["HOST_TAG", "PROCESS_TAG", "has_died", "machine", "process_name", "process_tags"]
 
-
 HOST_TAG, PROCESS_TAG = "process.host", "process.id"
 
 
 @cache
 def machine() -> str:
-    """This machine: its name for people, and what tells it from others of that name, its own earlier boots included.
+    """Name of this machine, with a digest that distinguishes it from others of that name and from its earlier boots.
 
     Process numbers mean something within one boot only, and within one container where it counts its own.
     """
@@ -41,7 +40,7 @@ def process_name() -> str:
 
 
 def process_tags() -> dict[str, str]:
-    """By which a later run finds out that this process has died."""
+    """Tags from which a later run finds out that this process has ended."""
     return {HOST_TAG: machine(), PROCESS_TAG: str(os.getpid())}
 
 
@@ -59,7 +58,7 @@ def has_died(process: str) -> bool:
     return False
 
 
-def _process_has_died(run: Run) -> bool:
+def has_owner_died(run: Run) -> bool:
     tags = run.data.tags
     if HOST_TAG not in tags or PROCESS_TAG not in tags:
         return False

@@ -13,16 +13,25 @@ from lightning_pose.errors import ImageError
 from lightning_pose.scenes.images import decode_image, read_bytes
 from lightning_pose.scenes.scene import Scene
 
-__all__ = ["JUMP", "JUMP_DEG", "SHOWN", "Findings", "ImageFile", "inspect_images", "inspect_poses"]
-
+__all__ = [
+    "Findings",
+    "ImageFile",
+    "find_angle_deg",
+    "format_counts",
+    "inspect_images",
+    "inspect_poses",
+    "map_frames_to_splits",
+    "measure_steps",
+    "read_image_file",
+    "stack_positions",
+    "stack_quats",
+]
 
 JUMP = 20.0
 """A step this many times the median is a jump; hand-held real sequences stay below five times."""
 
-
 JUMP_DEG = 30.0
 """A turn must reach this many degrees, and JUMP times the median, to count as a jump."""
-
 
 SHOWN = 5
 """Findings of one kind that are printed one by one."""
@@ -56,7 +65,7 @@ def inspect_images(scene: Scene, files: list[ImageFile]) -> Findings:
     first: dict[bytes, int] = {}
     copies = [(i, first.setdefault(file.digest, i)) for i, file in enumerate(files) if file.digest]
     copies = [(i, original) for i, original in copies if i != original]
-    split_of = _split_of(scene)
+    split_of = map_frames_to_splits(scene)
     leaks = [(i, j) for i, j in copies if (split_of[i] == "test") != (split_of[j] == "test")]
     warnings = []
     for pairs, complaint in (
@@ -71,16 +80,16 @@ def inspect_images(scene: Scene, files: list[ImageFile]) -> Findings:
             warnings.append(f"{len(pairs)} {complaint}: {scene.frames[i].image} is {scene.frames[j].image}")
     sizes = Counter(file.size for file in files if file.size)
     if len(sizes) > 1:
-        warnings.append(f"images of {len(sizes)} sizes, {_counted(sizes)}; resize them unless the cameras differ")
-    return Findings(_shortened(errors, "unreadable images"), warnings)
+        warnings.append(f"images of {len(sizes)} sizes, {format_counts(sizes)}; resize them unless the cameras differ")
+    return Findings(limit_findings(errors, "unreadable images"), warnings)
 
 
 def inspect_poses(scene: Scene) -> Findings:
     """Jumps between neighbouring frames, and a camera that never moves."""
-    step, angle_deg, neighbours = _steps(scene)
+    step, angle_deg, neighbours = measure_steps(scene)
     if not len(step):
         return Findings([], [])
-    if not np.ptp(_positions(scene), axis=0).any():
+    if not np.ptp(stack_positions(scene), axis=0).any():
         where = f"all {len(scene.frames)} positions are {scene.frames[0].position_m}"
         return Findings([f"{where}; there is nothing to learn, check the pose files"], [])
     typical = float(np.median(step))
@@ -92,10 +101,11 @@ def inspect_poses(scene: Scene) -> Findings:
         for k, i in enumerate(neighbours)
         if far[k] or turned[k]
     ]
-    return Findings([], _shortened(jumps, "jumps"))
+    return Findings([], limit_findings(jumps, "jumps"))
 
 
-def _read_file(path: Path) -> ImageFile:
+def read_image_file(path: Path) -> ImageFile:
+    """Digest and size of an image file, or what is wrong with it."""
     try:
         data = read_bytes(path)
         height, width = decode_image(data, path, color=False).shape
@@ -104,41 +114,45 @@ def _read_file(path: Path) -> ImageFile:
     return ImageFile(hashlib.blake2b(data, digest_size=16).digest(), f"{width}x{height}")
 
 
-def _steps(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def measure_steps(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Distance and angle (degrees) from each frame to the next of its sequence, per index, and the frames."""
     sequences = np.array([frame.sequence for frame in scene.frames])
     neighbours = np.flatnonzero(sequences[1:] == sequences[:-1])
-    positions, quats = _positions(scene), _quats(scene)
+    positions, quats = stack_positions(scene), stack_quats(scene)
     gap = np.maximum(np.diff([frame.index for frame in scene.frames])[neighbours], 1)
     step = np.linalg.norm(positions[neighbours + 1] - positions[neighbours], axis=1)
-    angle = _angle_deg(quats[neighbours], quats[neighbours + 1])
+    angle = find_angle_deg(quats[neighbours], quats[neighbours + 1])
     return step / gap, angle / gap, neighbours
 
 
-def _positions(scene: Scene) -> np.ndarray:
+def stack_positions(scene: Scene) -> np.ndarray:
+    """Camera centres of all frames, (F, 3), in the scene's unit."""
     return np.array([frame.position_m for frame in scene.frames])
 
 
-def _quats(scene: Scene) -> np.ndarray:
+def stack_quats(scene: Scene) -> np.ndarray:
+    """Orientations of all frames, (F, 4) wxyz, camera-to-world."""
     return np.array([frame.quat_wxyz for frame in scene.frames])
 
 
-def _angle_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def find_angle_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Angles between unit quaternions, in degrees: (N,) of (4,) or (N, 4) and (N, 4)."""
     apart, together = np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)
     # Not the arc cosine of the product: that has no digits left near zero.
     return np.degrees(4 * np.arctan2(np.minimum(apart, together), np.maximum(apart, together)))
 
 
-def _split_of(scene: Scene) -> dict[int, str]:
+def map_frames_to_splits(scene: Scene) -> dict[int, str]:
+    """Frame index to the name of its split."""
     return {int(i): split for split, indices in scene.splits.items() for i in indices}
 
 
-def _shortened(texts: list[str], what: str) -> list[str]:
+def limit_findings(texts: list[str], what: str) -> list[str]:
     """The first few, and how many there are in all."""
     more = [f"{len(texts)} {what} in all"] if len(texts) > SHOWN else []
     return texts[:SHOWN] + more
 
 
-def _counted(sizes: Counter[str]) -> str:
+def format_counts(sizes: Counter[str]) -> str:
+    """The most frequent sizes in words, with their counts where there are several."""
     return ", ".join(size if len(sizes) == 1 else f"{size} ({count})" for size, count in sizes.most_common(SHOWN))
