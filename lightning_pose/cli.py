@@ -130,7 +130,7 @@ def _help(verb: str) -> dict[str, Any]:
 
 
 def _quieten() -> None:
-    """Drop what Lightning tells of devices, restored files and its own use of torch: no user can act on it."""
+    """Drop messages of Lightning about devices, restored files and its own use of torch: no user can act on them."""
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", message=".*LeafSpec.*")  # Lightning's own use of torch

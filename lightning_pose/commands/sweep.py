@@ -121,7 +121,7 @@ def main(argv: list[str]) -> int:
 
 
 def _run(study: Study, plan: Plan, job: Job, total: int, workers: int) -> None:
-    """Run the trials under a bar that tells the best value so far."""
+    """Run the trials under a progress bar that shows the best value so far."""
     from lightning_pose.sweeps.workers import run_alone, run_together
 
     console = Console(stderr=True)

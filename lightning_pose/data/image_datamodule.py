@@ -28,8 +28,8 @@ class ImageDataModule(SceneDataModule):
         batch_size: frames in a training batch.
         eval_batch_size: frames in a batch where no gradient is needed.
         feature_pool: in training, draw the N features of each frame at random from so many times N of its strongest,
-            anew in every epoch, so that no frame is known by heart; validation and test read the N strongest. None
-            never draws. For extractors of local features only; the pool ends with the 300 that the cache holds.
+            anew in every epoch, so that the network cannot memorise frames; validation and test read the N strongest.
+            None never draws. For extractors of local features only; the pool ends with the 300 that the cache holds.
         cache_dir: where extracted features are kept; the user's cache folder if not given.
         workers: processes or threads that extract features; every core if not given.
         room_seed: which synthetic room.

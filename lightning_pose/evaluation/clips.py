@@ -141,7 +141,7 @@ def _answer(module: ClipModule, clips: ClipDataset) -> Pose:
 
 
 def _odometry(sequences: list[Sequence], clips: ClipDataset) -> Pose:
-    """Visual odometry's poses of all clips; in world axes it is told each clip's first orientation."""
+    """Visual odometry's poses of all clips; in world axes it is given each clip's first orientation."""
     rows = torch.cat([sequence.rows for sequence in sequences])
     place = torch.full((int(rows.max()) + 1,), -1)
     place[rows] = torch.arange(len(rows))

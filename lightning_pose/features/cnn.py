@@ -99,7 +99,7 @@ class CNN(FeatureExtractor):
 
     @cached_property
     def feature_shape(self) -> tuple[int, ...]:
-        """(C,) or (C, h, w); named backbones tell it from their layers alone, before any weights are there.
+        """(C,) or (C, h, w); for named backbones it follows from the layers alone, before any weights are read.
 
         Raises:
             ConfigError: the size is too small for the network, or it breaks the contract of `build_backbone`.

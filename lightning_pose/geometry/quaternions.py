@@ -151,8 +151,8 @@ def mean_quat(quat_wxyz: Tensor, weights: Tensor | None = None) -> Tensor:
 def orientation_error_deg(a: Tensor, b: Tensor) -> Tensor:
     """Angle of the rotation between two orientations, `2 * acos(|<a, b>|)`, in degrees.
 
-    Computed as `4 * atan2(|a - b|, |a + b|)`: acos loses all digits near zero (in float32 it cannot tell
-    0.03 degrees from none), this keeps them.
+    Computed as `4 * atan2(|a - b|, |a + b|)`: acos loses all digits near zero (in float32 0.03 degrees
+    become 0), this keeps them.
 
     Args:
         a: (..., 4) wxyz; any length, normalised here.

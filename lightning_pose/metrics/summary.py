@@ -1,6 +1,6 @@
 """What is reported of a set of pose errors: median, mean, 95th percentile and recalls.
 
-Apart from `metrics`, because torchmetrics takes seconds to import and reports and baselines do without it.
+Apart from `pose_metrics`, because torchmetrics takes seconds to import and reports and baselines do without it.
 """
 
 from __future__ import annotations

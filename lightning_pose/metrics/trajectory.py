@@ -55,9 +55,9 @@ def trajectory_errors(position_hat: Array, quat_hat: Array, position: Array, qua
     - `ate_origin_rmse_m`: position error once the first poses coincide: `evo_ape --align_origin`. How far it drifts.
     - `rpe_rmse_m`, `rpe_rmse_deg`: error of each step, from a row to the next: `evo_rpe --delta 1`.
 
-    NaN is what a sequence is too short to tell: `ate_rmse_m` of fewer than three poses, which can be laid on almost
-    anything, and all four of fewer than two. A prediction with a pose that is not finite has infinite errors, so that
-    losing track never looks better than drifting.
+    A metric is NaN where the sequence is too short for it: `ate_rmse_m` of fewer than three poses, which can be laid on
+    almost anything, and all four of fewer than two. A prediction with a pose that is not finite has infinite errors, so
+    that losing track never looks better than drifting.
 
     Args:
         position_hat: (M, 3) predicted camera centres, metres, in any world: they are aligned here.
@@ -81,7 +81,7 @@ def trajectory_errors(position_hat: Array, quat_hat: Array, position: Array, qua
 def mean_over_sequences(per_sequence: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
     """Mean of each metric, every sequence counting once, whatever its length.
 
-    A sequence whose metric is NaN (too short to tell) is left out of that metric's mean, which is NaN where none has
+    A sequence whose metric is NaN (too short a sequence) is left out of that metric's mean, which is NaN where none has
     it. An infinite error stays, and makes the mean infinite.
 
     Args:

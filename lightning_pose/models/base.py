@@ -114,7 +114,7 @@ class PoseModule(LightningModule):
 
     @property
     def headline(self) -> str:
-        """The settings that tell one run of this architecture from another, for run names and tables."""
+        """The settings that distinguish runs of this architecture, for run names and tables."""
         return "x".join(map(str, self.input_shape))
 
     @property
@@ -161,7 +161,7 @@ class PoseModule(LightningModule):
     def fit_feature_scale(self, features: Tensor) -> None:
         """Learn each column's mean and spread from (B, *input_shape) training features.
 
-        Rows of zeros, where a frame had fewer features, do not count. A thousand frames tell enough.
+        Rows of zeros, where a frame had fewer features, do not count. A thousand frames are enough.
         """
         if not self.standardize_features:
             return

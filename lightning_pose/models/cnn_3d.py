@@ -24,7 +24,7 @@ class CNN3D(ClipModule):
     Args:
         channels: filters of both convolutions.
         units: width of the linear layer.
-        causal: let frames hear earlier ones only, up to four of them, for a live camera.
+        causal: let a frame's answer depend on earlier frames only, up to four of them, for a live camera.
         dropout: before the last linear layer.
         **kwargs: what `ClipModule` takes.
 

@@ -21,7 +21,7 @@ class CNNRNN(ClipModule):
     Args:
         channels: filters of both convolutions.
         units: of the LSTM, in each direction.
-        bidirectional: let frames hear later ones as well; off, an answer is causal, for a live camera.
+        bidirectional: let a frame's answer depend on later frames too; off, an answer is causal, for a live camera.
         dropout: before the last linear layer.
         **kwargs: what `ClipModule` takes.
 

@@ -22,9 +22,9 @@ _CHUNK = 1024  # nodes whose neighbours' states are gathered at a time
 
 
 class NodePose(PoseModule):
-    """Graph convolutions over images: a node hears the K training images nearest in feature space.
+    """Graph convolutions over images: each node has edges from the K nearest training images in feature space.
 
-    Edges lead from training images alone, and to a query as to a training image. So queries never hear each other,
+    All edges start at training images; they end at queries and at training images. So queries never affect each other,
     and the training images' states, computed once, serve them all. The training images' features are part of the
     checkpoint.
 
@@ -115,7 +115,7 @@ class NodePose(PoseModule):
             self.remember(self.trainer.datamodule.dataset("train").data)  # type: ignore[attr-defined]
 
     def remember(self, train: PoseBatch) -> None:
-        """Take in the training images that nodes hear, once the scale of poses is known, and join them."""
+        """Store the training images, once the scale of poses is known, and join them by edges."""
         train = PoseBatch(*(tensor[train.frame.argsort()].to(self.device) for tensor in train))
         pose = torch.cat([train.position_m, align_hemisphere(train.quat_wxyz, self.quat_reference)], dim=-1)
         self.memory_features = train.features
@@ -151,7 +151,7 @@ class NodePose(PoseModule):
         return self._unscaled(self.network.heads(answer))
 
     def _remembered(self) -> _Memory:
-        """What queries are compared with and what they hear; computed when first needed."""
+        """What queries are compared with and what they receive; computed when first needed."""
         if self._memory is None or self._memory.keys.device != self.device:
             with torch.inference_mode(False), torch.no_grad():
                 states = self.network.states(self._standardized(self.memory_features), self.memory_table)
@@ -174,7 +174,7 @@ class NodePose(PoseModule):
 
 class _Memory(NamedTuple):
     """What N training images are to a query: `keys` (N, D) it is compared with, `states` (N, C) that each convolution
-    hears, and `offset` (N, 7), the scaled pose less the slope's part of the network's answer."""
+    receives, and `offset` (N, 7), the scaled pose less the slope's part of the network's answer."""
 
     keys: Tensor
     states: list[Tensor]
@@ -203,8 +203,8 @@ class _NodeNetwork(nn.Module):
     def hear(self, layer: int, target: Tensor, source: Tensor, table: Tensor) -> Tensor:
         """(B, C) states of targets after a convolution over the (M, C) sources that `table` (B, K) joins them to."""
         source_row, target_row = edge_index(table)
-        heard, source_row = source_row.unique(return_inverse=True)
-        target, source = self.dropout(target), self.dropout(source[heard])
+        used, source_row = source_row.unique(return_inverse=True)
+        target, source = self.dropout(target), self.dropout(source[used])
         return self.convolutions[layer](target, source, torch.stack([source_row, target_row])).relu()
 
 

@@ -17,18 +17,18 @@ __all__ = ["PICKS", "Choice", "Pick", "pick_runs"]
 Pick = Literal["best", "latest", "spread"]
 PICKS: tuple[Pick, ...] = ("best", "latest", "spread")
 VALIDATION = ("val/position_median_m", "val/loss")
-"""Of a run's best epoch, `best/...`, or of its last where it does not tell that one."""
+"""Of a run's best epoch, `best/...`, or of its last where that is missing."""
 
 
 @dataclass
 class Choice:
-    """What must be told of the choices made, cell by cell.
+    """What the notes must say of the choices made, cell by cell.
 
     Attributes:
-        notes: where it is told.
+        notes: the notes of the table.
         by: how many cells were decided by each metric.
         judged: how many runs that took.
-        by_last: how many of them tell only their last epoch's.
+        by_last: how many of them have only their last epoch's metric.
     """
 
     notes: list[str]
@@ -67,7 +67,7 @@ def pick_runs(runs: Sequence[Run], pick: Pick, cell: str, choice: Choice) -> lis
     """The runs that a cell shows.
 
     - `best`: the lowest validation error, `val/position_median_m` or else `val/loss`, never a test error: that of the
-      best epoch, or of the last where a run does not tell its best. Where no run has one, the newest run.
+      best epoch, or of the last where a run lacks that. Where no run has one, the newest run.
     - `latest`: the newest run.
     - `spread`: all runs of `fit`, which may differ in nothing but the seed; of several with one seed, the newest.
 

@@ -53,7 +53,7 @@ SEEDS = {"seed"}
 def column_facts(runs: Sequence[Run]) -> dict[str, str]:
     """What the runs of one scene share.
 
-    A run that does not tell a fact goes with any: older runs lack some.
+    A run without a fact matches every value: older runs lack some.
 
     Raises:
         ConfigError: two runs differ in a fact, so that their errors do not compare.
@@ -75,7 +75,7 @@ def column_facts(runs: Sequence[Run]) -> dict[str, str]:
 
 
 def missing_facts(runs: Sequence[Run]) -> str | None:
-    """A note on the facts that some runs do not tell; None where all do."""
+    """A note on the facts that some runs lack; None where none does."""
     missing: dict[str, int] = {}
     for fact in FACTS:
         about = [run for run in runs if fact not in OF_CLIPS or run.settings.get("task") == "relative"]
@@ -114,7 +114,7 @@ def describe_facts(facts: Mapping[str, str]) -> str:
 
 def tested(scene: str, facts: Mapping[str, str], fact: str) -> str | None:
     """A fact of the scene that a column's errors are of: of `den to chess`, trained in one and tested in the other, a
-    run tells the ground truth `synthetic+original`."""
+    run has the ground truth `synthetic+original`."""
     told = facts.get(fact)
     if told is None or "+" in scene.rpartition(" to ")[2]:
         return told
@@ -122,13 +122,13 @@ def tested(scene: str, facts: Mapping[str, str], fact: str) -> str | None:
 
 
 def same_data(runs: Sequence[Run]) -> bool:
-    """Whether runs tell of the same scene, split and number of test frames, whatever folder they read them from."""
+    """Whether runs have the same scene, split and number of test frames, whatever folder they read them from."""
     told = {tuple(run.settings.get(fact) for fact in ("scene", "split", "test_frames")) for run in runs}
     return len(told) == 1 and None not in next(iter(told))
 
 
 def differing_settings(runs: Iterable[Run], ignore: Iterable[str] = ()) -> dict[str, list[str]]:
-    """Settings of the runs that differ, with their values; what a run does not tell goes with anything.
+    """Settings of the runs that differ, with their values; a run without a setting matches every value.
 
     Args:
         runs: two or more, or nothing differs.

@@ -83,12 +83,12 @@ def select_runs(runs: Sequence[Run], filters: Filters) -> tuple[list[Run], list[
 
 
 def setting(run: Run, name: str) -> str | None:
-    """A tag or a parameter by its name; None where the run does not tell it."""
+    """A tag or a parameter by its name; None where the run has none."""
     return run.settings.get(name)
 
 
 def check_setting(name: str, runs: Iterable[Run]) -> None:
-    """Refuse the name of a setting that no run tells.
+    """Refuse the name of a setting that no run has.
 
     Raises:
         ConfigError: with names that are near.
@@ -109,7 +109,7 @@ def read_date(text: str, end: bool = False) -> Date:
         end: of a whole day, its end.
 
     Raises:
-        ConfigError: it is neither, or lies beyond what the clock can tell.
+        ConfigError: it is neither, or is outside the range of dates.
     """
     try:
         date = datetime.fromisoformat(text)

@@ -219,7 +219,7 @@ def _differences(scene: str, name: str, facts: Mapping[str, str]) -> list[str]:
 
 
 def _seen(scene: str, facts: Mapping[str, str]) -> bool:
-    """Whether the scene tested on was trained on, by the split or, where no run tells that, by the names."""
+    """Whether the scene tested on was trained on, by the split or, where no run records that, by the names."""
     if "split" in facts:
         return facts["split"] != "unseen"
     learned, apart, asked = scene.rpartition(" to ")

@@ -1,4 +1,4 @@
-"""Runs to a table: a row a system, a column a scene; several runs of one cell are joined by a rule that is told."""
+"""Runs to a table: a row a system, a column a scene; a rule that the table states joins several runs of one cell."""
 
 from __future__ import annotations
 
@@ -190,7 +190,7 @@ def add_means(report: Report, rows: Sequence[Row]) -> None:
 
 
 def _differing(report: Report, scenes: Sequence[str], facts: Sequence[str]) -> list[str]:
-    """Which facts the scenes differ in, in words; what a run does not tell goes with any."""
+    """Which facts the scenes differ in, in words; a run without a fact matches every value."""
     told = {fact: {tested(scene, report.facts[scene], fact) for scene in scenes} - {None} for fact in facts}
     return [fact.replace("_", " ") for fact, values in told.items() if len(values) > 1]
 

@@ -69,7 +69,7 @@ def _make_log(axes: Axes, which: str) -> None:
 
 
 def _lines(cells: Sequence[Cell], spec: FigureSpec) -> Lines:
-    """Cells by what tells one line from another."""
+    """Cells by the settings that distinguish lines."""
     apart = [key for key in varying(cells) if key != spec.x]
     lines: Lines = {}
     for cell in cells:
@@ -79,7 +79,7 @@ def _lines(cells: Sequence[Cell], spec: FigureSpec) -> Lines:
 
 
 def _told(key: str, cell: Cell, spec: FigureSpec) -> str:
-    """A setting in a legend: its value, and its name where that does not speak for itself."""
+    """A setting in a legend: its value, and its name where the value alone is not clear."""
     value = cell.values[key]
     if key == SCENE and not value:
         return "synthetic room"

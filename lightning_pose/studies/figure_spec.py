@@ -11,7 +11,6 @@ from lightning_pose.sweeps.space import BASE, MEASURES, Parameter, nearest
 
 __all__ = ["FigureSpec", "parse_figure_spec"]
 
-
 KINDS = ("line", "bar", "curve", "pictures")
 FIELDS = ("x", "y", "kind", "log", "beside", "title", "table", "labels")
 ERRORS = ("position_median_m", "orientation_median_deg")

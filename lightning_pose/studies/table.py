@@ -74,7 +74,7 @@ def gather(study: Study, plan: Plan) -> list[Cell]:
 
 
 def name_scenes(cells: Sequence[Cell]) -> None:
-    """Call folders of the same name by as much of their paths as tells them apart."""
+    """Call folders of the same name by as much of their paths as makes them distinct."""
     cells = [cell for cell in cells if SCENE in cell.values]
     paths = {path: Path(path).parts for cell in cells if isinstance(path := cell.values[SCENE], str)}
     for length in range(1, 1 + max(map(len, paths.values()), default=0)):
@@ -121,7 +121,7 @@ def named(value: Any) -> str:
 
 
 def varying(cells: Iterable[Cell]) -> list[str]:
-    """The settings that have several values; what a system alone has, and always the same, tells nothing apart."""
+    """The settings that have several values; what a system alone has, and always the same, distinguishes nothing."""
     cells = list(cells)
     keys = dict.fromkeys(key for cell in cells for key in cell.values)
     return [key for key in keys if len({str(cell.values[key]) for cell in cells if key in cell.values}) > 1]

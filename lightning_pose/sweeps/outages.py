@@ -31,7 +31,7 @@ def _patient(method: F) -> F:
 
 
 class PatientStorage(RDBStorage):
-    """What a sweep needs of the database is tried again for two minutes, and a heart that cannot be heard beats on.
+    """Retries each storage operation for two minutes; a failed heartbeat does not stop the heartbeat thread.
 
     Optuna itself gives up at once, which would end a training run of hours for a server's restart.
     """
@@ -76,7 +76,7 @@ class PatientStorage(RDBStorage):
             self._missed = time.monotonic()
 
     def _get_stale_trial_ids(self, study_id: int) -> list[int]:
-        """Trials whose heart has stopped; none just after an outage, in which no heart could be heard."""
+        """Trials without a recent heartbeat; none just after an outage, which heartbeats could not pass."""
         if time.monotonic() - self._missed < (self.grace_period or 0):
             return []
         return self.insist(lambda: super(PatientStorage, self)._get_stale_trial_ids(study_id))

@@ -35,7 +35,7 @@ def connect(url: str, silent: Callable[[Study, FrozenTrial], None]) -> PatientSt
 
     Args:
         url: SQLAlchemy's address, of SQLite or PostgreSQL.
-        silent: called for a trial that has just been failed because its process told nothing for a minute.
+        silent: called for a trial that Optuna has just failed because no heartbeat came for a minute.
 
     Raises:
         ConfigError: the database cannot be reached or read, or is of a kind that commands cannot share.
@@ -114,7 +114,7 @@ def alone(storage: PatientStorage, study: str) -> Iterator[None]:
     """Wait until no other process is in here for this study, and keep others out.
 
     Optuna has no such lock: of two processes that look at the queue of a SQLite file at once both may take the same
-    trial, and two that fill it do so twice. A process that dies gives the lock back.
+    trial, and two that fill it do so twice. The lock of a process that ends is released.
 
     Args:
         storage: of `connect`.

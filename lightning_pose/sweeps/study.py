@@ -198,10 +198,10 @@ def queue_again(study: Study, trial: FrozenTrial, died: bool) -> int | None:
     Args:
         study: that has it.
         trial: which has ended.
-        died: whether its process did; a trial may be interrupted as often as the user likes.
+        died: whether its process ended by itself, which is counted; interrupts by the user are not.
 
     Returns:
-        The number that it waits under, None where it died too often.
+        The number of the queued trial, None where its process has ended too often.
     """
     deaths = trial.user_attrs.get(DEATHS, 0) + died
     if deaths > DEATHS_FORGIVEN:
@@ -218,7 +218,7 @@ def queue_again(study: Study, trial: FrozenTrial, died: bool) -> int | None:
 
 
 def _fell_silent(tracking: str, study: Study, trial: FrozenTrial) -> None:
-    """Queue a trial again, of whatever machine, that Optuna has failed because its heart stopped."""
+    """Queue a trial again that Optuna has failed because its heartbeats stopped, on any machine."""
     _tell(trial.number, "fell silent", queue_again(study, trial, died=True))
     close_run(MlflowClient(tracking), trial.user_attrs.get(RUN), "its process fell silent")
 
@@ -229,11 +229,11 @@ def _tell(number: int, what: str, queued: int | None) -> None:
 
 
 def recover(study: Study, storage: PatientStorage, client: MlflowClient) -> set[int]:
-    """Fail the trials of this machine whose process is gone, without waiting for their hearts to stop, and those of
-    any machine whose heart has stopped; queue them again.
+    """Fail the trials of this machine whose process is gone, without waiting for its heartbeats to be missed, and
+    those of any machine whose heartbeats have stopped; queue them again.
 
     The caller keeps others out (`alone`): a trial under way that no process calls its own is then one whose process
-    died as it took it.
+    ended as it took the trial.
 
     Returns:
         The numbers of this machine's trials that were queued again.

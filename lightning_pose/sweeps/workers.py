@@ -102,7 +102,7 @@ def _hear_once() -> None:
 
 
 def _run_one(study: Study, storage: PatientStorage, job: Job, taken: Taken = lambda number: None) -> bool:
-    """One trial; what goes wrong in it is its own affair. False where the study's grid has none left.
+    """Run one trial; its exceptions are recorded, not raised. Returns False if no grid point is waiting.
 
     One process at a time takes a trial, so that each is taken once, and writes down that it is its own.
     """
@@ -178,7 +178,7 @@ class _Worker:
 def run_together(job: Job, total: int, finished: Finished, workers: int) -> None:
     """Run this many trials in several processes, and each of them once.
 
-    A trial whose process dies does not count: it is queued again, and another worker takes it.
+    A trial whose process ends does not count: it is queued again, and another worker takes it.
 
     Raises:
         KeyboardInterrupt: Ctrl-C; trials under way are queued again.
@@ -294,7 +294,7 @@ def _check_killed(worker: _Worker) -> None:
 
 
 def _stop(crew: list[_Worker]) -> None:
-    """Let workers end that did not hear the Ctrl-C themselves."""
+    """End the workers that did not receive the Ctrl-C themselves."""
     for worker in crew:
         worker.process.join(1.0)
         if worker.process.is_alive():

@@ -76,10 +76,10 @@ def visual_odometry(
 
     One camera cannot know its scale, so **each step's length is taken from the truth**; only its direction and
     rotation are estimated. A step that fails (`two_view_motion`) stands still. In `world` axes, the positions are
-    turned by the clip's **true first orientation**, which the images cannot tell either.
+    turned by the clip's **true first orientation**, which images do not give either.
 
     Each image is described once, and each pair of frames that some clip has as neighbours is matched once. A camera
-    that the dataset does not tell has `FOCAL_PER_SIDE` of the longer side as its focal length and its centre in the
+    that the dataset does not give has `FOCAL_PER_SIDE` of the longer side as its focal length and its centre in the
     middle.
 
     Args:

@@ -1,4 +1,4 @@
-"""Graph convolutions of PyTorch Geometric behind one face, in which nodes that hear need not be those that speak."""
+"""Wraps any PyTorch Geometric convolution for bipartite graphs: separate source and target nodes."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class GraphConvolution(nn.Module):
             raise ConfigError(f"conv {conv!r} answers with shape {tuple(shape)}, not {(1, out_width)}; give another")
 
     def forward(self, target: Tensor, source: Tensor, edges: Tensor) -> Tensor:
-        """Let targets hear their neighbours.
+        """Compute new states of the target nodes from their neighbours.
 
         Args:
             target: (B, in_width).
@@ -79,7 +79,7 @@ class GraphConvolution(nn.Module):
         edges = torch.stack([torch.cat([edges[0] + first, itself]), torch.cat([edges[1], itself])])
         if not self.is_gcn:
             return self.layer(nodes, edges)[:B]
-        # Every node hears equally many, so GCN's D^-1/2 (A + I) D^-1/2 is the mean over a node and its neighbours.
+        # All nodes have equally many neighbours: GCN's D^-1/2 (A + I) D^-1/2 is the mean over a node and them.
         weight = 1 / edges[1].bincount(minlength=B)[edges[1]].to(nodes.dtype)
         return self.layer(nodes, edges, weight)[:B]
 

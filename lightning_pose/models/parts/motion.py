@@ -1,4 +1,4 @@
-"""Where features moved from one frame of a clip to the next: what relative poses can be told from in any scene."""
+"""Where features moved from one frame of a clip to the next: input from which relative poses follow in any scene."""
 
 from __future__ import annotations
 

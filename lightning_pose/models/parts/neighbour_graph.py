@@ -1,6 +1,6 @@
 """Graphs of nearest neighbours: the search, its edges, and the part of a graph that some nodes depend on.
 
-A graph is a table (N, K) of int64: row i holds the nodes that node i hears, nearest first, and `ABSENT` in
+A graph is a table (N, K) of int64: row i holds the neighbours of node i, nearest first, and `ABSENT` in
 the places that stay empty.
 """
 
@@ -67,7 +67,7 @@ def neighbours_within(nodes: Tensor, k: int) -> Tensor:
 
 
 def edge_index(table: Tensor) -> Tensor:
-    """(2, E) edges as PyG reads them, from each neighbour (first row) to the node that hears it (second row)."""
+    """Edges (2, E) as PyG reads them: from each neighbour (first row) to its node (second row)."""
     node, place = (table != ABSENT).nonzero(as_tuple=True)
     return torch.stack([table[node, place], node])
 

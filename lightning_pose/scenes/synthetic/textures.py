@@ -266,7 +266,7 @@ def _age(rng: np.random.Generator, image: np.ndarray, amount: float) -> np.ndarr
 
 
 def _flower(image: np.ndarray, rng: np.random.Generator, at: np.ndarray, r: float, ink: tuple) -> None:
-    """A closed curve with a random number of petals, and a heart of another colour."""
+    """A closed curve with a random number of petals, and a centre of another colour."""
     angle = np.linspace(0, 2 * np.pi, 48, endpoint=False)
     petals, phase, depth = rng.integers(3, 9), rng.uniform(0, 6.3), rng.uniform(0.15, 0.6)
     radius = r * (1 - depth * np.cos(petals * angle + phase) ** 2)
