@@ -1,0 +1,1 @@
+"""Geometry from the training images: whether their poses fit them, and the landmark map."""
