@@ -1,0 +1,105 @@
+"""The pose of one camera from points whose places in the world and in the image are known."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+__all__ = ["CameraPose", "RefinedPose", "find_pose_ransac", "refine_pose"]
+
+MAX_ITERATIONS = 1000
+CONFIDENCE = 0.9999
+
+
+class CameraPose(NamedTuple):
+    """Camera-to-world rotation (3, 3), and the camera's centre (3,)."""
+
+    rotation: np.ndarray
+    position: np.ndarray
+
+
+class RefinedPose(NamedTuple):
+    """A pose with the normal matrix of its last step.
+
+    Attributes:
+        pose: the pose.
+        normal: (6, 6), J^T W J of the errors in units of `sigma`, over a rotation in the camera's axes (radians) and
+            a movement in the world's.
+    """
+
+    pose: CameraPose
+    normal: np.ndarray
+
+
+def find_pose_ransac(points: np.ndarray, observed: np.ndarray, threshold: float) -> tuple[CameraPose, np.ndarray] | None:
+    """The pose on which most points agree: AP3P (Ke & Roumeliotis, CVPR 2017) within RANSAC.
+
+    Args:
+        points: (N, 3), in the world.
+        observed: (N, 2), normalised image coordinates.
+        threshold: largest image error of an inlier, in normalised image coordinates.
+
+    Returns:
+        the pose and the (N,) mask of its inliers; None if fewer than four points are given or agree.
+    """
+    if len(points) < 4:
+        return None
+    origin = points.mean(axis=0)  # far from zero, squares of coordinates lose the digits that matter
+    found, turn, shift, inliers = cv2.solvePnPRansac(
+        np.ascontiguousarray(points - origin),
+        np.ascontiguousarray(observed),
+        np.eye(3),
+        None,
+        iterationsCount=MAX_ITERATIONS,
+        reprojectionError=threshold,
+        confidence=CONFIDENCE,
+        flags=cv2.SOLVEPNP_AP3P,
+    )
+    if not found or inliers is None or len(inliers) < 4 or not (np.isfinite(turn).all() and np.isfinite(shift).all()):
+        return None
+    to_camera = Rotation.from_rotvec(turn[:, 0]).as_matrix()
+    mask = np.zeros(len(points), bool)
+    mask[inliers[:, 0]] = True
+    return CameraPose(to_camera.T, origin - to_camera.T @ shift[:, 0]), mask
+
+
+def refine_pose(
+    pose: CameraPose, points: np.ndarray, observed: np.ndarray, sigma: float, steps: int = 8
+) -> RefinedPose:
+    """Gauss-Newton on the image errors with Cauchy's weights.
+
+    Args:
+        pose: where to start.
+        points: (N, 3), in the world.
+        observed: (N, 2), normalised image coordinates.
+        sigma: scale of Cauchy's weights, in normalised image coordinates.
+        steps: at most; fewer when the pose no longer moves.
+    """
+    rotation, position = pose
+    normal = np.zeros((6, 6))
+    for _ in range(steps):
+        local = (points - position) @ rotation
+        x, y, z = local.T
+        z = np.maximum(z, 1e-9)
+        u, v = x / z, y / z
+        error = np.column_stack([u, v]) - observed
+        weight = 1 / (1 + (error**2).sum(axis=1) / sigma**2) / sigma**2
+        one, zero = 1 / z, np.zeros_like(z)
+        # Turning the camera by w (its own axes) moves a local point by local x w; moving it by d moves it by -R^T d.
+        turn = np.stack([u * v, -(1 + u * u), v, 1 + v * v, -u * v, -u], axis=1).reshape(-1, 2, 3)
+        to_image = np.stack([one, zero, -u * one, zero, one, -v * one], axis=1).reshape(-1, 2, 3)
+        jacobian = np.concatenate([turn, -to_image @ rotation.T], axis=2)
+        weighted = jacobian * weight[:, None, None]
+        normal = np.tensordot(weighted, jacobian, axes=([0, 1], [0, 1]))
+        right = np.tensordot(weighted, error, axes=([0, 1], [0, 1]))
+        # Scaled to a unit diagonal: radians and the scene's unit differ by orders of magnitude.
+        scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
+        step = -scale * np.linalg.lstsq(normal * np.outer(scale, scale), right * scale, rcond=1e-12)[0]
+        rotation = rotation @ Rotation.from_rotvec(step[:3]).as_matrix()
+        position = position + step[3:]
+        if np.abs(step[:3]).max() < 1e-7 and np.abs(step[3:]).max() < 1e-7 * float(np.median(z)):
+            break
+    return RefinedPose(CameraPose(rotation, position), normal)

@@ -1,0 +1,53 @@
+"""MapFrames: posed frames with their keypoints, the one form in which all stages of map building read them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+__all__ = ["MapFrames"]
+
+
+@dataclass(frozen=True)
+class MapFrames:
+    """F posed frames with up to N keypoints each, strongest first.
+
+    Keypoints are normalised image coordinates: (pixel - principal point) / focal length, distortion removed. So no
+    stage knows a camera model; `focal_px` turns thresholds in pixels into normalised units.
+
+    Attributes:
+        points: (F, N, 2) float64, normalised image coordinates; zeros past `count`.
+        size_px: (F, N) float32, diameters of the keypoints; zeros past `count`.
+        descriptors: (F, N, D) float32, L2-normalised; zeros past `count`.
+        count: (F,) int64, how many of the N keypoints are real.
+        focal_px: (F,) float64.
+        half_view: (F, 2) float64, half the width and height of the image in normalised image coordinates.
+        rotation: (F, 3, 3) float64, camera-to-world.
+        position: (F, 3) float64, camera centres, in the scene's unit relative to its origin.
+    """
+
+    points: np.ndarray
+    size_px: np.ndarray
+    descriptors: np.ndarray
+    count: np.ndarray
+    focal_px: np.ndarray
+    half_view: np.ndarray
+    rotation: np.ndarray
+    position: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.count)
+
+    def select(self, frames: np.ndarray) -> MapFrames:
+        """The frames of these numbers."""
+        return MapFrames(**{name: value[frames] for name, value in vars(self).items()})
+
+    def with_poses(self, rotation: np.ndarray, position: np.ndarray) -> MapFrames:
+        """The same frames with other poses."""
+        return replace(self, rotation=rotation, position=position)
+
+    @property
+    def real(self) -> np.ndarray:
+        """(F, N) bool, which keypoints are real."""
+        return np.arange(self.points.shape[1]) < self.count[:, None]

@@ -1,0 +1,81 @@
+"""Which pairs of frames to match: those that see the same things from places far enough apart."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lightning_pose.mapping.frames import MapFrames
+
+__all__ = ["choose_pairs", "estimate_depth"]
+
+MIN_OVERLAP = 0.4
+"""Share of either image that the other must see, at the nominal depth."""
+
+MIN_BASELINE = 0.015
+"""Distance between the cameras, in nominal depths; below it depths are too uncertain to help."""
+
+PARTNERS = 12
+"""Partners chosen for each frame, spread evenly from the nearest to the farthest."""
+
+GRID = (7, 5)
+"""Points across and down an image that stand for what it sees."""
+
+
+def estimate_depth(rotation: np.ndarray, position: np.ndarray) -> float:
+    """A typical distance from the cameras to what they see: to the point that is nearest to all optical axes.
+
+    Needs no scale. Where the axes do not meet (a camera that looks outward as it goes), the point lies behind many
+    cameras, and the distance is of the order of the path's extent.
+
+    Args:
+        rotation: (F, 3, 3), camera-to-world.
+        position: (F, 3).
+
+    Returns:
+        the median distance, above 0.
+    """
+    axis = rotation[:, :, 2]
+    across = np.eye(3) - axis[:, :, None] * axis[:, None, :]
+    normal = across.sum(axis=0)
+    meeting = np.linalg.lstsq(normal, (across @ position[:, :, None]).sum(axis=0)[:, 0], rcond=1e-9)[0]
+    depth = float(np.median(np.linalg.norm(position - meeting, axis=1)))
+    extent = float(np.linalg.norm(np.ptp(position, axis=0)))
+    return max(depth, extent * 1e-3, np.finfo(float).tiny)
+
+
+def choose_pairs(frames: MapFrames, depth: float, partners: int = PARTNERS) -> np.ndarray:
+    """Pairs of frames to match.
+
+    Args:
+        frames: with poses.
+        depth: nominal distance of what the frames see.
+        partners: chosen for each frame; a pair that two frames choose counts once.
+
+    Returns:
+        (P, 2) int64, first frame below the second, in ascending order.
+    """
+    seen = _measure_overlaps(frames, depth)
+    baseline = np.linalg.norm(frames.position[:, None] - frames.position[None], axis=2)
+    candidate = (np.minimum(seen, seen.T) >= MIN_OVERLAP) & (baseline >= MIN_BASELINE * depth)
+    pairs: set[tuple[int, int]] = set()
+    for i, row in enumerate(candidate):
+        others = np.flatnonzero(row)
+        others = others[np.argsort(baseline[i, others], kind="stable")]
+        chosen = np.unique(np.linspace(0, len(others) - 1, partners).round().astype(int)) if len(others) else []
+        pairs.update((min(i, j), max(i, j)) for j in others[chosen].tolist())
+    return np.array(sorted(pairs), np.int64).reshape(-1, 2)
+
+
+def _measure_overlaps(frames: MapFrames, depth: float) -> np.ndarray:
+    """(F, F): the share of frame i's image, at the nominal depth, that frame j sees."""
+    x, y = np.meshgrid(*(np.linspace(-1, 1, n) for n in GRID))
+    unit = np.column_stack([x.ravel(), y.ravel()])
+    overlap = np.empty((len(frames), len(frames)))
+    for i in range(len(frames)):
+        local = np.column_stack([unit * frames.half_view[i], np.ones(len(unit))]) * depth
+        world = local @ frames.rotation[i].T + frames.position[i]
+        seen = np.einsum("fgk,fkl->fgl", world[None] - frames.position[:, None], frames.rotation)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inside = (np.abs(seen[..., :2] / seen[..., 2:]) <= frames.half_view[:, None]).all(axis=2)
+        overlap[i] = (inside & (seen[..., 2] > 0)).mean(axis=1)
+    return overlap

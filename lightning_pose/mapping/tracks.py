@@ -1,0 +1,60 @@
+"""Tracks: which keypoints of different frames are one point of the scene."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lightning_pose.mapping.guided_matching import KeypointMatches
+
+__all__ = ["join_tracks"]
+
+
+def join_tracks(matches: KeypointMatches, n_keypoints: int, min_length: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Join matched keypoints into tracks, the most alike first; no track has two keypoints of one frame.
+
+    A match that would put two keypoints of one frame into a track is passed over. (Joining everything that is linked
+    makes one track of most keypoints: a single wrong match joins two points.)
+
+    Args:
+        matches: of pairs of frames.
+        n_keypoints: N, keypoints a frame has at most.
+        min_length: shortest track that is returned.
+
+    Returns:
+        track (O,), frame (O,) and keypoint (O,) of each observation, int64, sorted by track, then frame.
+    """
+    ids = matches.frame * n_keypoints + matches.keypoint
+    nodes, index = np.unique(ids, return_inverse=True)
+    index = index.reshape(-1, 2)
+    parent = list(range(len(nodes)))
+    frame_of = (nodes // n_keypoints).tolist()
+    members: list[set[int] | None] = [None] * len(nodes)
+    order = np.lexsort((ids[:, 1], ids[:, 0], matches.distance))
+    for a, b in index[order].tolist():
+        while parent[a] != a:
+            parent[a] = parent[parent[a]]
+            a = parent[a]
+        while parent[b] != b:
+            parent[b] = parent[parent[b]]
+            b = parent[b]
+        if a == b:
+            continue
+        of_a = members[a] or {frame_of[a]}
+        of_b = members[b] or {frame_of[b]}
+        if len(of_a) < len(of_b):
+            a, b, of_a, of_b = b, a, of_b, of_a
+        if of_a.isdisjoint(of_b):
+            of_a |= of_b
+            members[a], members[b] = of_a, None
+            parent[b] = a
+    for node in range(len(nodes)):
+        root = node
+        while parent[root] != root:
+            root = parent[root]
+        parent[node] = root
+    roots, track, length = np.unique(np.array(parent, np.int64), return_inverse=True, return_counts=True)
+    kept = length[track] >= min_length
+    number = np.cumsum(length >= min_length) - 1
+    track, nodes = number[track[kept]], nodes[kept]
+    order = np.lexsort((nodes, track))
+    return track[order], nodes[order] // n_keypoints, nodes[order] % n_keypoints
