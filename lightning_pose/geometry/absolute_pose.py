@@ -34,7 +34,9 @@ class RefinedPose(NamedTuple):
     normal: np.ndarray
 
 
-def find_pose_ransac(points: np.ndarray, observed: np.ndarray, threshold: float) -> tuple[CameraPose, np.ndarray] | None:
+def find_pose_ransac(
+    points: np.ndarray, observed: np.ndarray, threshold: float
+) -> tuple[CameraPose, np.ndarray] | None:
     """The pose on which most points agree: AP3P (Ke & Roumeliotis, CVPR 2017) within RANSAC.
 
     Args:

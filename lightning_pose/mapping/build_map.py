@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,22 +13,31 @@ from lightning_pose.geometry.triangulation import (
     sum_by_track,
     widest_angles_deg,
 )
+from lightning_pose.mapping.bundle_adjustment import Adjustment, CameraCorrection, adjust_bundle
 from lightning_pose.mapping.depth_vote import vote_depths
 from lightning_pose.mapping.frames import MapFrames
 from lightning_pose.mapping.guided_matching import match_pairs
-from lightning_pose.mapping.landmark_map import LandmarkMap, quantize_descriptors
-from lightning_pose.mapping.pairs import choose_pairs, estimate_depth
+from lightning_pose.mapping.pairs import FEW_FRAMES, choose_pairs, estimate_depth
+from lightning_pose.mapping.point_map import PointMap, quantize_descriptors
 from lightning_pose.mapping.tracks import join_tracks
 
-__all__ = ["Tracks", "build_landmark_map", "find_tracks", "summarize_tracks", "triangulate_tracks"]
+__all__ = ["Tracks", "build_point_map", "find_tracks", "summarize_tracks", "triangulate_tracks"]
 
 MIN_OBSERVATIONS = 5
 """Frames that must see a point. (3 doubles the map and gains nothing.)"""
 
+MIN_OBSERVATIONS_OF_FEW = 3
+"""The same where there are at most `FEW_FRAMES`."""
+
 MIN_ANGLE_DEG = 1.5
 """Angle between the widest rays of a point."""
 
+ADJUSTMENTS = 2
+"""Rounds of matching, triangulation and bundle adjustment."""
+
 HUBER_PX = 1.5
+"""An observation counts in full up to this error."""
+
 GATES_PX = (12.0, 6.0, 3.0)
 """Observations farther than this from their point are left out, gate after gate."""
 
@@ -55,13 +64,31 @@ class Tracks:
         return Tracks(track, self.frame[observations], self.keypoint[observations], self.points[kept])
 
 
-def build_landmark_map(frames: MapFrames) -> LandmarkMap:
-    """The map of posed frames: pairs, guided matches, depth vote, tracks, triangulation.
+def build_point_map(frames: MapFrames, adjust: bool = False) -> PointMap:
+    """The map of posed frames: pairs, guided matches, depth vote, tracks, triangulation, bundle adjustment.
 
     Args:
-        frames: with poses that are taken as they are.
+        frames: with the poses that the dataset gives.
+        adjust: move poses, points and camera until they agree with the images, twice: poses that are better find
+            more matches. Without it, the given poses are taken as they are.
     """
-    return summarize_tracks(frames, triangulate_tracks(frames, find_tracks(frames)))
+    return summarize_tracks(frames, *map_frames(frames, adjust))
+
+
+def map_frames(frames: MapFrames, adjust: bool) -> tuple[MapFrames, Tracks, CameraCorrection]:
+    """The frames as the map's own cameras saw them, the map's tracks, and what was wrong with the assumed camera."""
+    if not adjust:
+        return frames, triangulate_tracks(frames, find_tracks(frames)), CameraCorrection()
+    seen, tracks = frames, triangulate_tracks(frames, find_tracks(frames))
+    state = Adjustment(frames.rotation, frames.position, tracks.points)
+    for again in range(ADJUSTMENTS):
+        if again:
+            tracks = triangulate_tracks(seen, find_tracks(seen))
+        state = adjust_bundle(replace(state, points=tracks.points), frames, tracks.track, tracks.frame, tracks.keypoint)
+        points = np.where(frames.real[:, :, None], state.camera.remove(frames.points), 0.0)
+        seen = replace(frames.with_poses(*state.camera_poses), points=points)
+        tracks = replace(tracks, points=state.points)
+    return seen, triangulate_tracks(seen, tracks), state.camera
 
 
 def find_tracks(frames: MapFrames) -> Tracks:
@@ -69,7 +96,7 @@ def find_tracks(frames: MapFrames) -> Tracks:
     pairs = choose_pairs(frames, estimate_depth(frames.rotation, frames.position))
     matches = match_pairs(frames, pairs)
     matches = matches.select(vote_depths(frames, matches))
-    track, frame, keypoint = join_tracks(matches, frames.points.shape[1], MIN_OBSERVATIONS)
+    track, frame, keypoint = join_tracks(matches, frames.points.shape[1], count_observations(frames))
     n_tracks = int(track[-1]) + 1 if len(track) else 0
     points = find_midpoints(track, frames.position[frame], find_rays(frames, frame, keypoint), n_tracks)
     return Tracks(track, frame, keypoint, points)
@@ -84,15 +111,22 @@ def triangulate_tracks(frames: MapFrames, tracks: Tracks) -> Tracks:
         error = np.linalg.norm(reprojection_errors(points[tracks.track], centre, rotation, observed), axis=1)
         near = error * focal_px <= gate_px
         count = np.bincount(tracks.track[near], minlength=len(points))
-        near &= count[tracks.track] >= MIN_OBSERVATIONS
+        near &= count[tracks.track] >= count_observations(frames)
         tracks = Tracks(tracks.track, frame, tracks.keypoint, points).select(near)
     rays = find_rays(frames, tracks.frame, tracks.keypoint)
     wide = widest_angles_deg(tracks.track, rays, len(tracks.points)) >= MIN_ANGLE_DEG
     return tracks.select(wide[tracks.track])
 
 
-def summarize_tracks(frames: MapFrames, tracks: Tracks) -> LandmarkMap:
-    """What the map keeps of each point."""
+def summarize_tracks(given: MapFrames, frames: MapFrames, tracks: Tracks, camera: CameraCorrection) -> PointMap:
+    """What a map keeps.
+
+    Args:
+        given: the frames with the poses that the dataset gives.
+        frames: the same with the poses of the map.
+        tracks: its points and their observations.
+        camera: what was wrong with the assumed camera.
+    """
     n = len(tracks.points)
     count = np.bincount(tracks.track, minlength=n)[:, None]
     to_camera = frames.position[tracks.frame] - tracks.points[tracks.track]
@@ -101,7 +135,7 @@ def summarize_tracks(frames: MapFrames, tracks: Tracks) -> LandmarkMap:
     size = frames.size_px[tracks.frame, tracks.keypoint] / frames.focal_px[tracks.frame] * distance
     descriptors = sum_by_track(tracks.track, frames.descriptors[tracks.frame, tracks.keypoint].astype(float), n)
     order = np.lexsort((tracks.track, tracks.frame))
-    return LandmarkMap(
+    return PointMap(
         points=tracks.points,
         descriptors=quantize_descriptors(descriptors),
         log_size=(sum_by_track(tracks.track, np.log2(size)[:, None], n) / count)[:, 0].astype(np.float32),
@@ -110,7 +144,15 @@ def summarize_tracks(frames: MapFrames, tracks: Tracks) -> LandmarkMap:
         seen_frame=tracks.frame[order].astype(np.int32),
         rotation=frames.rotation,
         position=frames.position,
+        given_rotation=given.rotation,
+        given_position=given.position,
+        camera=np.array([camera.scale, *camera.centre, camera.k1]),
     )
+
+
+def count_observations(frames: MapFrames) -> int:
+    """How many frames must see a point."""
+    return MIN_OBSERVATIONS if len(frames) > FEW_FRAMES else MIN_OBSERVATIONS_OF_FEW
 
 
 def find_rays(frames: MapFrames, frame: np.ndarray, keypoint: np.ndarray) -> np.ndarray:

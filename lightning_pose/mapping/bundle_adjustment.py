@@ -20,7 +20,7 @@ __all__ = ["Adjustment", "CameraCorrection", "adjust_bundle"]
 CAUCHY_PX = 2.0
 """Scale of Cauchy's weights on image errors, which is also the errors' standard deviation."""
 
-POSE_SD = (0.01, 0.01)
+POSE_SD = (0.005, 0.005)
 """Standard deviations of the given poses: radians, and a share of the median depth."""
 
 OFFSET_SD = (0.005, 0.005)
@@ -211,8 +211,7 @@ class _Problem:
         squared = (ideal**2).sum(axis=1)
         camera = state.camera
         bent = camera.scale * (
-            (1 + camera.k1 * squared)[:, None, None] * np.eye(2)
-            + 2 * camera.k1 * ideal[:, :, None] * ideal[:, None, :]
+            (1 + camera.k1 * squared)[:, None, None] * np.eye(2) + 2 * camera.k1 * ideal[:, :, None] * ideal[:, None, :]
         )
         project = np.zeros((len(z), 2, 3))
         project[:, 0, 0] = project[:, 1, 1] = 1 / z

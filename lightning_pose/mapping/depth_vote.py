@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 
 from lightning_pose.geometry.triangulation import find_two_view_depths
@@ -72,26 +74,22 @@ def _find_supporters(
     step, start = np.einsum("dij,dj->di", rotation, ray).astype(np.float32), start.astype(np.float32)
     observed, gate = observed.astype(np.float32), ((agree_px / frames.focal_px[far]) ** 2).astype(np.float32)
 
-    size = np.bincount(group)
-    first = np.cumsum(size) - size
-    votes = np.zeros(len(group), np.int64)
-    supports = np.zeros(len(group), bool)
-
     def agrees(z: np.ndarray, voter: np.ndarray) -> np.ndarray:
         local = z[:, None] * step[voter] + start[voter]
         with np.errstate(divide="ignore", invalid="ignore"):
             error = local[:, :2] / local[:, 2:] - observed[voter]
         return ((error**2).sum(axis=1) <= gate[voter]) & (local[:, 2] > 0) & (z > 0)
 
-    of_proposer = size[group]
-    ends = np.cumsum(of_proposer)
-    cuts = [0, *np.searchsorted(ends, np.arange(CHUNK, ends[-1], CHUNK)).tolist(), len(group)] if len(group) else []
-    for low, high in zip(cuts, cuts[1:], strict=False):
-        proposer = np.repeat(np.arange(low, high), of_proposer[low:high])
-        within = np.arange(len(proposer)) - np.repeat(ends[low:high] - of_proposer[low:high] - (ends[low - 1] if low else 0), of_proposer[low:high])
-        voter = first[group[proposer]] + within
+    size = np.bincount(group)
+    first = np.cumsum(size) - size
+    votes = np.zeros(len(group), np.int64)
+    voters = size[group]  # of each proposer: its whole group
+    done = np.cumsum(voters)
+    cuts = np.searchsorted(done, np.arange(0, done[-1] + CHUNK, CHUNK), side="right").tolist() if len(group) else []
+    for low, high in itertools.pairwise(cuts):
+        count = voters[low:high]
+        proposer = np.repeat(np.arange(low, high), count)
+        voter = np.arange(len(proposer)) + np.repeat(first[group[low:high]] - np.cumsum(count) + count, count)
         votes[low:high] = np.bincount(proposer - low, agrees(depth[proposer], voter), high - low)
-    best = np.lexsort((np.arange(len(group)), -votes, group))[first] if len(group) else np.zeros(0, np.int64)
-    enough = votes[best] >= SUPPORTERS
-    supports = agrees(depth[best][group], np.arange(len(group))) & enough[group]
-    return supports
+    best = np.lexsort((-votes, group))[first]
+    return agrees(depth[best][group], np.arange(len(group))) & (votes[best] >= SUPPORTERS)[group]

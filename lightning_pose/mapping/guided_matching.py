@@ -65,7 +65,7 @@ def match_pairs(frames: MapFrames, pairs: np.ndarray, band_px: float = BAND_PX) 
     descriptors = torch.from_numpy(frames.descriptors)
     log_size = torch.from_numpy(np.where(frames.real, np.log2(np.maximum(frames.size_px, 1e-6)), np.inf)).float()
     band = torch.from_numpy(band_px / frames.focal_px).float()
-    found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    found: list[tuple[np.ndarray, ...]] = []
     for start in range(0, len(pairs), BATCH):
         chunk = slice(start, start + BATCH)
         i, j = torch.from_numpy(a[chunk]), torch.from_numpy(b[chunk])

@@ -1,30 +1,31 @@
-"""Locating one image in a landmark map."""
+"""Locating one image in a point map."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from lightning_pose.geometry.absolute_pose import CameraPose, find_pose_ransac, refine_pose
-from lightning_pose.mapping.landmark_map import LandmarkMap
+from lightning_pose.geometry.absolute_pose import CameraPose, RefinedPose, find_pose_ransac, refine_pose
+from lightning_pose.mapping.point_map import PointMap
+from lightning_pose.mapping.query_matching import QueryMatcher
 
 __all__ = ["MapAnswer", "MapLocalizer", "MapQuery"]
 
-VOTE_DISTANCE = 0.6
-MATCH_DISTANCE = 0.6
-MATCH_RATIO = 0.85
-CANDIDATES = 12
 MIN_MATCHES = 8
+"""Fewer matches are no start for RANSAC."""
+
 RANSAC_PX = 6.0
-GUIDED_PX = 8.0
-GUIDED_DISTANCE = 0.7
-GUIDED_RATIO = 0.9
-SIZE_OCTAVES = 1.0
-MIN_COSINE = 0.5
 SIGMA_PX = 1.0
+"""Scale of Cauchy's weights in the last refinement."""
+
 INLIER_PX = 3.0
 ACCEPT_INLIERS = 20
+"""Guided matches within 3 px that an accepted pose needs. With 12, poses came through that were metres off."""
+
+KERNEL = (0.05, 5.0)
+"""How far training frames lend their offset to an answer: in median depths of the map's points, and degrees."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ class MapQuery:
         size_px: (N,) float32.
         descriptors: (N, D) float32, L2-normalised.
         focal_px: focal length.
-        half_view: (2,) half the width and height of the image in normalised image coordinates.
+        half_view: (2,), half the width and height of the image in normalised image coordinates.
     """
 
     points: np.ndarray
@@ -48,137 +49,115 @@ class MapQuery:
 
 @dataclass(frozen=True)
 class MapAnswer:
-    """Where an image was taken.
+    """Where an image was taken, and how sure the map is.
 
     Attributes:
-        pose: None where refused before a pose was found.
+        pose: in the poses that the dataset gives; of the most similar training frame where nothing better was found.
+        pose_in_map: the same before it was carried back to the given poses.
         inliers: guided matches within 3 px.
-        visible: points of the map in view.
-        reason: why the map refuses, or an empty string where it accepts.
-        normal: (6, 6), as of `RefinedPose`.
+        visible: points of the map that the image should show.
+        reason: why the map refuses; empty where it accepts.
+        position_sd: standard deviation of the position by the image errors alone, in the scene's unit; inf if refused
+            before a pose was refined. Calibration turns it into a radius.
+        orientation_sd_deg: the same of the orientation, in degrees.
+        covariance: (6, 6), of a rotation in the camera's axes (radians) and a movement in the world's.
     """
 
-    pose: CameraPose | None
+    pose: CameraPose
+    pose_in_map: CameraPose
     inliers: int
     visible: int
     reason: str
-    normal: np.ndarray | None = None
+    position_sd: float = np.inf
+    orientation_sd_deg: float = np.inf
+    covariance: np.ndarray | None = None
+
+    @property
+    def accepted(self) -> bool:
+        return not self.reason
 
 
 class MapLocalizer:
     """A map, prepared for queries.
 
     Args:
-        landmark_map: the map.
+        point_map: the map; at least one training frame.
+        without: numbers of training frames that answers may not use, as if they had not been in the training.
     """
 
-    def __init__(self, landmark_map: LandmarkMap) -> None:
-        self.map = landmark_map
-        self._descriptors = landmark_map.unit_descriptors
-        n_frames = len(landmark_map.rotation)
-        length = np.bincount(landmark_map.seen_point, minlength=len(landmark_map))
-        self._vote = (1 / np.sqrt(np.maximum(length, 1))).astype(np.float32)
-        self._points_of_frame = np.bincount(landmark_map.seen_frame, minlength=n_frames)
-        self._first = np.concatenate([[0], np.cumsum(self._points_of_frame)])
-        order = np.argsort(landmark_map.seen_point, kind="stable")
-        self._frames = landmark_map.seen_frame[order]
-        self._first_frame = np.concatenate([[0], np.cumsum(length)])
-        self._points = landmark_map.points
+    def __init__(self, point_map: PointMap, without: np.ndarray | None = None) -> None:
+        self.map = point_map
+        self._matcher = QueryMatcher(point_map)
+        self._camera = point_map.camera_correction
+        kept = np.ones(len(point_map.position), bool)
+        if without is not None:
+            kept[without] = False
+        self._kept = np.flatnonzero(kept)
+        back = np.swapaxes(point_map.rotation, 1, 2)[self._kept]
+        self._turn_back = Rotation.from_matrix(back @ point_map.given_rotation[self._kept]).as_rotvec()
+        moved = point_map.given_position[self._kept] - point_map.position[self._kept]
+        self._move_back = np.einsum("fij,fj->fi", back, moved)
+        self._adjusted = bool(np.abs(self._turn_back).max() > 1e-12 or np.abs(self._move_back).max() > 1e-12)
+        frame, point = point_map.seen_frame, point_map.seen_point
+        distance = np.linalg.norm(point_map.points[point] - point_map.position[frame], axis=1)
+        self._kernel = KERNEL[0] * (float(np.median(distance)) if len(distance) else 1.0)
 
     def locate(self, query: MapQuery) -> MapAnswer:
-        """Candidates, matches, RANSAC, one guided pass, refinement."""
-        if len(query.points) < MIN_MATCHES:
-            return MapAnswer(None, 0, 0, f"too few features: {len(query.points)}")
-        similarity = query.descriptors @ self._descriptors.T
-        rows, points = self._match(similarity)
+        """Where the image was taken: candidates, matches, RANSAC, one guided pass, refinement."""
+        points = self._camera.remove(query.points)
+        similarity = self._matcher.compare(query.descriptors)
+        frame, rows, matched = self._matcher.match_candidates(similarity)
         if len(rows) < MIN_MATCHES:
-            return MapAnswer(None, 0, 0, f"too few matches: {len(rows)}")
-        found = find_pose_ransac(self._points[points], query.points[rows], RANSAC_PX / query.focal_px)
+            few = f"too few features: {len(points)}" if len(points) < MIN_MATCHES else f"too few matches: {len(rows)}"
+            return self._refuse(frame, few)
+        found = find_pose_ransac(self.map.points[matched], points[rows], RANSAC_PX / query.focal_px)
         if found is None:
-            return MapAnswer(None, 0, 0, "weak geometry: no pose agrees with four matches")
+            return self._refuse(frame, f"weak geometry: no pose agrees with four of {len(rows)} matches")
         pose, mask = found
         sigma = SIGMA_PX / query.focal_px
-        pose = refine_pose(pose, self._points[points[mask]], query.points[rows[mask]], 2 * sigma).pose
-        rows, points, visible = self._match_guided(query, similarity, pose)
+        pose = refine_pose(pose, self.map.points[matched[mask]], points[rows[mask]], 2 * sigma).pose
+        rows, matched, visible = self._matcher.match_guided(query, points, similarity, pose)
         if len(rows) < MIN_MATCHES:
-            return MapAnswer(pose, len(rows), visible, f"too few guided inliers: {len(rows)}")
-        refined = refine_pose(pose, self._points[points], query.points[rows], sigma)
-        local = (self._points[points] - refined.pose.position) @ refined.pose.rotation
-        error = np.linalg.norm(local[:, :2] / np.maximum(local[:, 2:], 1e-9) - query.points[rows], axis=1)
+            return self._refuse(frame, f"too few guided matches: {len(rows)} of {visible} points in view", visible)
+        refined = refine_pose(pose, self.map.points[matched], points[rows], sigma)
+        local = (self.map.points[matched] - refined.pose.position) @ refined.pose.rotation
+        error = np.linalg.norm(local[:, :2] / np.maximum(local[:, 2:], 1e-9) - points[rows], axis=1)
         inliers = int((error * query.focal_px <= INLIER_PX).sum())
-        reason = "" if inliers >= ACCEPT_INLIERS else f"too few guided inliers: {inliers}"
-        return MapAnswer(refined.pose, inliers, visible, reason, refined.normal)
+        reason = "" if inliers >= ACCEPT_INLIERS else f"too few guided inliers: {inliers} of {visible} points in view"
+        return self._answer(refined, inliers, visible, reason)
 
-    def _match(self, similarity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Keypoints and points: mutual matches with what the most likely training frames saw."""
-        nearest = similarity.argmax(axis=1)
-        sure = similarity[np.arange(len(nearest)), nearest] > 1 - VOTE_DISTANCE**2 / 2
-        voted = nearest[sure]
-        first, last = self._first_frame[voted], self._first_frame[voted + 1]
-        frames = self._frames[_join_ranges(first, last)]
-        votes = np.bincount(frames, np.repeat(self._vote[voted], last - first), len(self._points_of_frame))
-        score = votes / np.sqrt(self._points_of_frame + 20.0)
-        best = np.argsort(-score, kind="stable")[:CANDIDATES]
-        points = np.unique(self.map.seen_point[_join_ranges(self._first[best], self._first[best + 1])])
-        if len(points) < 2:
-            return np.zeros(0, np.int64), np.zeros(0, np.int64)
-        among = similarity[:, points]
-        rows = np.arange(len(among))
-        best_point = among.argmax(axis=1)
-        best_row = among.argmax(axis=0)
-        value = among[rows, best_point]
-        among[rows, best_point] = -1
-        second = among.max(axis=1)
-        kept = (best_row[best_point] == rows) & (value > 1 - MATCH_DISTANCE**2 / 2)
-        kept &= (1 - value) < MATCH_RATIO**2 * (1 - second)
-        return rows[kept], points[best_point[kept]]
+    def _answer(self, refined: RefinedPose, inliers: int, visible: int, reason: str) -> MapAnswer:
+        covariance = np.linalg.pinv(refined.normal, hermitian=True)
+        spread = np.maximum(np.diag(covariance), 0.0)
+        return MapAnswer(
+            self.carry_back(refined.pose),
+            refined.pose,
+            inliers,
+            visible,
+            reason,
+            float(np.sqrt(spread[3:].sum())),
+            float(np.degrees(np.sqrt(spread[:3].sum()))),
+            covariance,
+        )
 
-    def _match_guided(
-        self, query: MapQuery, similarity: np.ndarray, pose: CameraPose
-    ) -> tuple[np.ndarray, np.ndarray, int]:
-        """Keypoints and points: mutual matches near where the pose puts the points; and how many are in view."""
-        away = self._points - pose.position
-        local = away @ pose.rotation
-        distance = np.linalg.norm(away, axis=1)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            seen = local[:, :2] / local[:, 2:]
-            inside = (np.abs(seen) <= query.half_view).all(axis=1) & (local[:, 2] > 0)
-        facing = -(away * self.map.direction).sum(axis=1) >= MIN_COSINE * distance
-        visible = np.flatnonzero(inside & facing)
-        if len(visible) < 2:
-            return np.zeros(0, np.int64), np.zeros(0, np.int64), len(visible)
-        seen = seen[visible].astype(np.float32)
-        log_size = self.map.log_size[visible] - np.log2(distance[visible]).astype(np.float32)
-        observed = query.points.astype(np.float32)
-        apart = (observed[:, :1] - seen[:, 0]) ** 2 + (observed[:, 1:] - seen[:, 1]) ** 2
-        possible = apart <= (GUIDED_PX / query.focal_px) ** 2
-        row, column = np.nonzero(possible)
-        size = np.log2(query.size_px[row] / query.focal_px)
-        value = similarity[row, visible[column]]
-        kept = (np.abs(size - log_size[column]) <= SIZE_OCTAVES) & (value > 1 - GUIDED_DISTANCE**2 / 2)
-        row, column, value = row[kept], column[kept], value[kept]
-        best, second = _rank_within(row, value)
-        best_of_point, _ = _rank_within(column, value)
-        chosen = best & best_of_point & ((1 - value) < GUIDED_RATIO**2 * (1 - second))
-        return row[chosen], visible[column[chosen]], len(visible)
+    def _refuse(self, frame: int, reason: str, visible: int = 0) -> MapAnswer:
+        frame = int(self._kept[0]) if frame < 0 else frame
+        given = CameraPose(self.map.given_rotation[frame], self.map.given_position[frame])
+        return MapAnswer(given, CameraPose(self.map.rotation[frame], self.map.position[frame]), 0, visible, reason)
 
+    def carry_back(self, pose: CameraPose) -> CameraPose:
+        """The pose that the dataset would give a camera at `pose` of the map: by what near training frames were moved.
 
-def _join_ranges(first: np.ndarray, last: np.ndarray) -> np.ndarray:
-    """The whole numbers from each `first` up to its `last`, one range after the other."""
-    length = last - first
-    return np.repeat(first - np.cumsum(length) + length, length) + np.arange(length.sum())
-
-
-def _rank_within(group: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Whether each value is the largest of its group, and the second largest of its group (-1 for none)."""
-    order = np.lexsort((-value, group))
-    start = np.diff(group[order], prepend=-1) != 0
-    best = np.zeros(len(group), bool)
-    best[order[start]] = True
-    second_at = np.flatnonzero(start) + 1
-    has_second = (second_at < len(group)) & ~np.append(start, True)[np.minimum(second_at, len(group))]
-    second = np.full(start.sum(), -1.0)
-    second[has_second] = value[order[second_at[has_second]]]
-    back = np.empty(len(group))
-    back[order] = np.repeat(second, np.diff(np.append(np.flatnonzero(start), len(group))))
-    return best, back
+        The offset of an answer is the mean of theirs, in the axes of the camera, weighted by a Gaussian of their
+        distance and angle to it.
+        """
+        if not self._adjusted:
+            return pose
+        away = np.linalg.norm(self.map.position[self._kept] - pose.position, axis=1) / self._kernel
+        cosine = (np.einsum("fij,ij->f", self.map.rotation[self._kept], pose.rotation) - 1) / 2
+        turned = np.degrees(np.arccos(np.clip(cosine, -1, 1))) / KERNEL[1]
+        squared = away**2 + turned**2
+        weight = np.exp(-0.5 * (squared - squared.min()))
+        weight /= weight.sum()
+        turn = Rotation.from_rotvec(weight @ self._turn_back).as_matrix()
+        return CameraPose(pose.rotation @ turn, pose.position + pose.rotation @ (weight @ self._move_back))

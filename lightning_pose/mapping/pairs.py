@@ -6,7 +6,7 @@ import numpy as np
 
 from lightning_pose.mapping.frames import MapFrames
 
-__all__ = ["choose_pairs", "estimate_depth"]
+__all__ = ["FEW_FRAMES", "choose_pairs", "estimate_depth"]
 
 MIN_OVERLAP = 0.4
 """Share of either image that the other must see, at the nominal depth."""
@@ -14,8 +14,13 @@ MIN_OVERLAP = 0.4
 MIN_BASELINE = 0.015
 """Distance between the cameras, in nominal depths; below it depths are too uncertain to help."""
 
-PARTNERS = 12
-"""Partners chosen for each frame, spread evenly from the nearest to the farthest."""
+PARTNERS = 8
+"""Partners chosen for each frame, spread evenly from the nearest to the farthest. 12 took longer and gained nothing."""
+
+PARTNERS_OF_FEW = 20
+"""The same where there are at most `FEW_FRAMES`: photos, in which each point is seen by few."""
+
+FEW_FRAMES = 200
 
 GRID = (7, 5)
 """Points across and down an image that stand for what it sees."""
@@ -43,17 +48,17 @@ def estimate_depth(rotation: np.ndarray, position: np.ndarray) -> float:
     return max(depth, extent * 1e-3, np.finfo(float).tiny)
 
 
-def choose_pairs(frames: MapFrames, depth: float, partners: int = PARTNERS) -> np.ndarray:
+def choose_pairs(frames: MapFrames, depth: float) -> np.ndarray:
     """Pairs of frames to match.
 
     Args:
         frames: with poses.
         depth: nominal distance of what the frames see.
-        partners: chosen for each frame; a pair that two frames choose counts once.
 
     Returns:
         (P, 2) int64, first frame below the second, in ascending order.
     """
+    partners = PARTNERS if len(frames) > FEW_FRAMES else PARTNERS_OF_FEW
     seen = _measure_overlaps(frames, depth)
     baseline = np.linalg.norm(frames.position[:, None] - frames.position[None], axis=2)
     candidate = (np.minimum(seen, seen.T) >= MIN_OVERLAP) & (baseline >= MIN_BASELINE * depth)

@@ -9,7 +9,9 @@ from lightning_pose.mapping.guided_matching import KeypointMatches
 __all__ = ["join_tracks"]
 
 
-def join_tracks(matches: KeypointMatches, n_keypoints: int, min_length: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def join_tracks(
+    matches: KeypointMatches, n_keypoints: int, min_length: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Join matched keypoints into tracks, the most alike first; no track has two keypoints of one frame.
 
     A match that would put two keypoints of one frame into a track is passed over. (Joining everything that is linked
@@ -52,7 +54,7 @@ def join_tracks(matches: KeypointMatches, n_keypoints: int, min_length: int) -> 
         while parent[root] != root:
             root = parent[root]
         parent[node] = root
-    roots, track, length = np.unique(np.array(parent, np.int64), return_inverse=True, return_counts=True)
+    _, track, length = np.unique(np.array(parent, np.int64), return_inverse=True, return_counts=True)
     kept = length[track] >= min_length
     number = np.cumsum(length >= min_length) - 1
     track, nodes = number[track[kept]], nodes[kept]

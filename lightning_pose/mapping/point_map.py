@@ -1,0 +1,73 @@
+"""PointMap: points of a scene with what they look like, and the training frames that saw them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from lightning_pose.mapping.bundle_adjustment import CameraCorrection
+
+__all__ = ["PointMap", "quantize_descriptors"]
+
+LARGEST = 127
+"""The largest element of a stored descriptor."""
+
+
+@dataclass(frozen=True)
+class PointMap:
+    """P points, seen O times by F training frames.
+
+    Positions are in the scene's unit. All fields are arrays, so that a map is stored as it is.
+
+    Attributes:
+        points: (P, 3) float64.
+        descriptors: (P, D) int8; `unit_descriptors` returns them at unit length.
+        log_size: (P,) float32, mean log2 of the keypoint's diameter as an angle (radians) times its distance.
+        direction: (P, 3) float32, mean direction from the point to the cameras that saw it, unit length.
+        seen_point: (O,) int32, the point of each observation.
+        seen_frame: (O,) int32, its frame; observations are sorted by frame, then point.
+        rotation: (F, 3, 3) float64, camera-to-world rotation of each training frame as the map has it.
+        position: (F, 3) float64.
+        given_rotation: (F, 3, 3) float64, as the dataset has it; the same if no pose was adjusted.
+        given_position: (F, 3) float64.
+        camera: (4,) float64: scale, centre x and y, and k1 of the `CameraCorrection`.
+    """
+
+    points: np.ndarray
+    descriptors: np.ndarray
+    log_size: np.ndarray
+    direction: np.ndarray
+    seen_point: np.ndarray
+    seen_frame: np.ndarray
+    rotation: np.ndarray
+    position: np.ndarray
+    given_rotation: np.ndarray
+    given_position: np.ndarray
+    camera: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @property
+    def unit_descriptors(self) -> np.ndarray:
+        """(P, D) float32, L2-normalised."""
+        full = self.descriptors.astype(np.float32)
+        return full / np.maximum(np.linalg.norm(full, axis=1, keepdims=True), 1e-12)
+
+    @property
+    def camera_correction(self) -> CameraCorrection:
+        """What was wrong with the assumed camera."""
+        scale, x, y, k1 = self.camera.tolist()
+        return CameraCorrection(scale, np.array([x, y]), k1)
+
+    @property
+    def n_bytes(self) -> int:
+        """Size of all arrays."""
+        return sum(getattr(self, field.name).nbytes for field in fields(self))
+
+
+def quantize_descriptors(descriptors: np.ndarray) -> np.ndarray:
+    """(P, D) int8 of (P, D) float descriptors: each is scaled to its largest element."""
+    largest = np.maximum(np.abs(descriptors).max(axis=1, keepdims=True), 1e-12)
+    return np.rint(descriptors / largest * LARGEST).astype(np.int8)
