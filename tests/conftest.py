@@ -9,10 +9,14 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from tests import shapes
+
 if TYPE_CHECKING:  # they take seconds to import, and most tests do without
     from tests.helpers import Trained, Workplace
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported: each test process has one core
+
+shapes.turn_on()
 
 
 @pytest.fixture(autouse=True, scope="session")
