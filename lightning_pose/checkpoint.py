@@ -1,6 +1,6 @@
 """What checkpoints hold besides weights: objects as plain specs (class path, arguments), and reading the files.
 
-A spec is what config files write: `describe` makes it from an object, `build` makes the object from it.
+A spec is what config files write: `describe_object` makes it from an object, `build_object` the object from it.
 `read_checkpoint` reads a file that `fit` wrote; class paths of older versions are replaced by today's.
 """
 
@@ -20,9 +20,9 @@ from lightning_pose.errors import CheckpointError
 __all__ = [
     "RENAMED_CLASSES",
     "Spec",
-    "build",
+    "build_object",
     "class_path",
-    "describe",
+    "describe_object",
     "read_checkpoint",
     "resolve_class_path",
     "resolve_class_paths",
@@ -94,13 +94,13 @@ def class_path(obj: object) -> str:
     return f"{cls.__module__}.{cls.__qualname__}"
 
 
-def describe(obj: object) -> Spec:
+def describe_object(obj: object) -> Spec:
     """The spec of an object that keeps every constructor argument as an attribute of the same name."""
     names = inspect.signature(type(obj)).parameters
     return {"class_path": class_path(obj), "init_args": {name: getattr(obj, name) for name in names}}
 
 
-def build(spec: Mapping[str, Any]) -> Any:
+def build_object(spec: Mapping[str, Any]) -> Any:
     """Make the object that a spec describes.
 
     Raises:

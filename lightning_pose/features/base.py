@@ -136,14 +136,14 @@ class LocalExtractor(FeatureExtractor):
         rows = record["descriptors"][: self.n_features]
         if not self.with_geometry:
             return rows
-        return np.concatenate([rows, _geometry(record)[: self.n_features]], axis=1, dtype=np.float32)
+        return np.concatenate([rows, _compute_geometry(record)[: self.n_features]], axis=1, dtype=np.float32)
 
     def appearance(self, features: Tensor) -> Tensor:
         """The descriptors without their geometry, whose scale would drown them."""
         return features[..., : self.descriptor_dim]
 
 
-def _geometry(record: Record) -> np.ndarray:
+def _compute_geometry(record: Record) -> np.ndarray:
     """(M, 4) float32: x, y in -1..1 (y by half the height), log size, and log response below the strongest."""
     x, y, size, response = record["keypoints"][:, :4].T
     real = np.arange(len(x)) < record["count"]

@@ -82,7 +82,7 @@ class FeatureCache:
         self.root = Path(root).expanduser() if root else cache_folder("features")
         self._about = {"format": _FORMAT, "name": extractor.name, "settings": dict(extractor.settings)}
         canonical = json.dumps(self._about, sort_keys=True, separators=(",", ":"))
-        self.folder = self.root / f"{extractor.name}-{_digest(canonical.encode(), 8)}"
+        self.folder = self.root / f"{extractor.name}-{_hash_bytes(canonical.encode(), 8)}"
 
     def fill(self, paths: Sequence[ImagePath], workers: int | None = None, progress: bool = True) -> FillReport:
         """Extract what the cache lacks; a run that was stopped goes on where it was.
@@ -132,11 +132,11 @@ class FeatureCache:
         job.read()
         started = time.perf_counter()
         if job.missing or job.damaged:
-            _prepare(self.folder, json.dumps(self._about, indent=2))
+            _prepare_folder(self.folder, json.dumps(self._about, indent=2))
             job.extract(progress)
         done = job.computed + job.redone
         if job.bad:
-            raise ImageError(_told([job.bad[number] for number in sorted(job.bad)], len(paths)))
+            raise ImageError(_join_errors([job.bad[number] for number in sorted(job.bad)], len(paths)))
         return FillReport(
             total=len(paths),
             computed=job.computed,
@@ -185,7 +185,7 @@ class _Job:
         size = min(_BATCH, -(-len(todo) // self.workers))
         batches = [todo[start : start + size] for start in range(0, len(todo), size)]
         workers = min(self.workers, len(batches))
-        with _bar(progress) as bar, _threads_inside(max(1, self.workers // workers)):
+        with _make_extraction_bar(progress) as bar, _set_inner_threads(max(1, self.workers // workers)):
             task = bar.add_task(f"{self.extractor.name} features", total=len(todo))
             pool = ThreadPoolExecutor(workers)
             try:
@@ -199,7 +199,7 @@ class _Job:
 
     def _key(self, number: int) -> str | None:
         try:
-            return _digest(read_bytes(self.paths[number]))
+            return _hash_bytes(read_bytes(self.paths[number]))
         except ImageError as error:
             self.bad[number] = error
             return None
@@ -240,12 +240,12 @@ class _Job:
 
     def _image(self, path: ImagePath, key: str) -> np.ndarray:
         data = read_bytes(path)
-        if _digest(data) != key:
+        if _hash_bytes(data) != key:
             raise ImageError(f"{path} changed while it was read; run again when nothing writes to it")
         return decode_image(data, path, color=self.extractor.color == "rgb")
 
 
-def _prepare(folder: Path, about: str) -> None:
+def _prepare_folder(folder: Path, about: str) -> None:
     """Make the folder, with its settings.json, and clear what killed writers left there."""
     write_whole(folder / "settings.json", about.encode())
     for temporary in folder.glob(f"**/*{TEMPORARY}"):
@@ -254,7 +254,7 @@ def _prepare(folder: Path, about: str) -> None:
                 temporary.unlink()
 
 
-def _digest(data: bytes, size: int = 20) -> str:
+def _hash_bytes(data: bytes, size: int = 20) -> str:
     return hashlib.blake2b(data, digest_size=size).hexdigest()
 
 
@@ -263,7 +263,7 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _told(errors: list[ImageError], total: int) -> str:
+def _join_errors(errors: list[ImageError], total: int) -> str:
     """One message for several images; the first three are named."""
     if len(errors) == 1:
         return str(errors[0])
@@ -272,7 +272,7 @@ def _told(errors: list[ImageError], total: int) -> str:
 
 
 @contextmanager
-def _threads_inside(count: int) -> Iterator[None]:
+def _set_inner_threads(count: int) -> Iterator[None]:
     """Let each of our threads use `count` of its own in torch and OpenCV, so that none fight over a core."""
     before = torch.get_num_threads(), cv2.getNumThreads()
     torch.set_num_threads(count)
@@ -291,7 +291,7 @@ class _RateColumn(ProgressColumn):
         return Text(f"{task.speed:.1f} images/s" if task.speed else "", style="progress.data.speed")
 
 
-def _bar(shown: bool) -> Progress:
+def _make_extraction_bar(shown: bool) -> Progress:
     return Progress(
         "{task.description}",
         BarColumn(),

@@ -84,7 +84,7 @@ class CNN(FeatureExtractor):
     def settings(self) -> Mapping[str, str | int | float | bool | None]:
         """What was asked for; weights of the user's own by a digest of them, so that a moved file is still cached."""
         if self.backbone not in BACKBONES:
-            weights = _digest_of_state(self._network)
+            weights = _hash_weights(self._network)
         elif Path(self.weights).is_file():
             weights = hashlib.blake2b(Path(self.weights).read_bytes(), digest_size=8).hexdigest()
         else:
@@ -107,7 +107,7 @@ class CNN(FeatureExtractor):
         if self.backbone in BACKBONES:
             network, device = Backbone(self.backbone).eval(), torch.device("cpu")
         else:
-            network, device = self._network, _device()
+            network, device = self._network, _choose_device()
         rgb = torch.zeros(1, 3, self._side, self._side, device=device)
         try:
             shape = tuple(self._run(network, rgb).shape[1:])
@@ -137,7 +137,7 @@ class CNN(FeatureExtractor):
             return []
         _ = self.feature_shape  # refuses a size or a network that cannot work
         rgb = torch.stack([self._prepare(image) for image in images])
-        rgb = rgb.to(_device(), memory_format=torch.channels_last)
+        rgb = rgb.to(_choose_device(), memory_format=torch.channels_last)
         stored = torch.float16 if self.output == "map" else torch.float32
         return [{"features": row.numpy()} for row in self._run(self._network, rgb).to("cpu", stored)]
 
@@ -152,7 +152,7 @@ class CNN(FeatureExtractor):
     def _network(self) -> nn.Module:
         with _LOADING:  # the cache extracts with several threads
             if self._loaded is None:
-                network = build_backbone(self.backbone, self.weights).eval().requires_grad_(False).to(_device())
+                network = build_backbone(self.backbone, self.weights).eval().requires_grad_(False).to(_choose_device())
                 # The layout that convolutions prefer: a sixth less time for EfficientNet-Lite0 on a CPU.
                 network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
                 self._loaded = network
@@ -164,9 +164,9 @@ class CNN(FeatureExtractor):
         height, width = image.shape[:2]
         rgb = torch.from_numpy(image).permute(2, 0, 1)[None].float() / 255
         if self.crop == "whole":
-            return _resize(rgb, side, side)[0]
+            return _resize_images(rgb, side, side)[0]
         scale = round(side * _RESIZE) / min(height, width)
-        rgb = _resize(rgb, round(height * scale), round(width * scale))
+        rgb = _resize_images(rgb, round(height * scale), round(width * scale))
         top, left = (rgb.shape[2] - side) // 2, (rgb.shape[3] - side) // 2
         return rgb[0, :, top : top + side, left : left + side]
 
@@ -178,15 +178,15 @@ class CNN(FeatureExtractor):
         return out.float().mean((2, 3)) if self.output == "vector" and out.ndim == 4 else out
 
 
-def _resize(rgb: Tensor, height: int, width: int) -> Tensor:
+def _resize_images(rgb: Tensor, height: int, width: int) -> Tensor:
     return F.interpolate(rgb, (height, width), mode="bilinear", antialias=True)
 
 
-def _device() -> torch.device:
+def _choose_device() -> torch.device:
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
-def _digest_of_state(network: nn.Module) -> str:
+def _hash_weights(network: nn.Module) -> str:
     digest = hashlib.blake2b(digest_size=8)
     for name, value in network.state_dict().items():
         digest.update(name.encode() + value.cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes())

@@ -59,7 +59,7 @@ class _OpenCVExtractor(LocalExtractor):
             x, y, size, response, angle = rows.T
             order = np.lexsort((angle, size, x, y, -response))[:count]
             keypoints[:count] = rows[order]
-            descriptors[:count] = _normalised(raw[order])
+            descriptors[:count] = _normalise_rows(raw[order])
         return {
             "descriptors": descriptors,
             "keypoints": keypoints,
@@ -68,7 +68,7 @@ class _OpenCVExtractor(LocalExtractor):
         }
 
 
-def _normalised(raw: np.ndarray) -> np.ndarray:
+def _normalise_rows(raw: np.ndarray) -> np.ndarray:
     """(n, D) float32 unit rows, out of float rows or of packed bits."""
     rows = np.unpackbits(raw, axis=1) * np.float32(2) - 1 if raw.dtype == np.uint8 else raw
     norms = np.linalg.norm(rows, axis=1, keepdims=True)

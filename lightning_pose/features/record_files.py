@@ -41,7 +41,7 @@ def read_record(file: Path) -> Record | None:
         raise CacheError(f"{file} cannot be read ({error}); check its permissions, or delete it") from error
     except (SafetensorError, ValueError, TypeError) as error:
         raise DamagedError(error) from error
-    if written != _checksum(record):
+    if written != _compute_checksum(record):
         raise DamagedError("its checksum differs")
     return record
 
@@ -54,7 +54,7 @@ def write_record(file: Path, record: Record) -> None:
     """
     # safetensors writes the memory of an array as it lies, transposed if the array is.
     record = {name: np.asarray(array, order="C") for name, array in record.items()}
-    write_whole(file, save(record, {"checksum": _checksum(record)}))
+    write_whole(file, save(record, {"checksum": _compute_checksum(record)}))
 
 
 def write_whole(file: Path, data: bytes) -> None:
@@ -77,7 +77,7 @@ def write_whole(file: Path, data: bytes) -> None:
         ) from error
 
 
-def _checksum(record: Record) -> str:
+def _compute_checksum(record: Record) -> str:
     """CRC-32 of every array's name, type, shape and bytes."""
     crc = 0
     for name in sorted(record):

@@ -9,7 +9,7 @@ from torch.nn import functional as F
 
 from lightning_pose.errors import ConfigError
 
-__all__ = ["global_vectors", "nearest"]
+__all__ = ["compute_global_vectors", "find_nearest"]
 
 VLAD_CENTRES = 64
 
@@ -18,7 +18,7 @@ VLAD_SAMPLE = 50_000
 CHUNK = 256
 
 
-def global_vectors(
+def compute_global_vectors(
     train_features: Tensor | np.ndarray, test_features: Tensor | np.ndarray, seed: int = 0
 ) -> tuple[Tensor, Tensor]:
     """One L2-normalised vector per image, in which near means alike; a blank image's is zero.
@@ -43,20 +43,20 @@ def global_vectors(
             "give both as (N, D), (N, M, D) or (N, C, H, W)"
         )
     if train.dim() == 3:
-        centres = _vlad_centres(train, seed)
-        return _vlad(train, centres), _vlad(test, centres)
+        centres = _learn_vlad_centres(train, seed)
+        return _compute_vlad(train, centres), _compute_vlad(test, centres)
     if train.dim() == 4:
         train, test = train.mean((2, 3)), test.mean((2, 3))
     return F.normalize(train, dim=-1), F.normalize(test, dim=-1)
 
 
-def nearest(query: Tensor, reference: Tensor, k: int) -> Tensor:
+def find_nearest(query: Tensor, reference: Tensor, k: int) -> Tensor:
     """(N_query, min(k, N_reference)) indices of the nearest reference rows, nearest first, ties in order."""
     rows = [torch.cdist(chunk, reference).sort(dim=1, stable=True).indices[:, :k] for chunk in query.split(CHUNK)]
     return torch.cat(rows)
 
 
-def _vlad_centres(descriptors: Tensor, seed: int) -> Tensor:
+def _learn_vlad_centres(descriptors: Tensor, seed: int) -> Tensor:
     """(K, D) k-means centres of a sample of (N, M, D) descriptors; K is smaller where these are few."""
     from sklearn.cluster import MiniBatchKMeans  # seconds to import, and only local descriptors need it
 
@@ -70,7 +70,7 @@ def _vlad_centres(descriptors: Tensor, seed: int) -> Tensor:
     return torch.from_numpy(kmeans.fit(sample).cluster_centers_).float()
 
 
-def _vlad(descriptors: Tensor, centres: Tensor) -> Tensor:
+def _compute_vlad(descriptors: Tensor, centres: Tensor) -> Tensor:
     """(N, K * D) VLAD vectors: per centre the sum of its descriptors' residuals (Jegou et al., CVPR 2010).
 
     Signed square roots tame bursts of one descriptor (Jegou et al., PAMI 2012); each centre's part is

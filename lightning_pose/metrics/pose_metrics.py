@@ -39,8 +39,8 @@ class PoseMetrics(Metric):
             position: (..., 3) true, metres.
             quat: (..., 4) true wxyz.
         """
-        position_error = position_error_m(_full(position_hat), _full(position))
-        orientation_error = orientation_error_deg(_full(quat_hat), _full(quat))
+        position_error = position_error_m(_promote_to_float32(position_hat), _promote_to_float32(position))
+        orientation_error = orientation_error_deg(_promote_to_float32(quat_hat), _promote_to_float32(quat))
         self.position_error_m.append(position_error.detach().flatten())
         self.orientation_error_deg.append(orientation_error.detach().flatten())
 
@@ -50,14 +50,14 @@ class PoseMetrics(Metric):
         Raises:
             ConfigError: no frame was added.
         """
-        return summarize_errors(_cat(self.position_error_m), _cat(self.orientation_error_deg))
+        return summarize_errors(_join_state(self.position_error_m), _join_state(self.orientation_error_deg))
 
 
-def _full(x: Tensor) -> Tensor:
+def _promote_to_float32(x: Tensor) -> Tensor:
     """At least single precision: the half precision that autocast leaves rounds metres to centimetres."""
     return x.to(torch.promote_types(x.dtype, torch.float32))
 
 
-def _cat(state: list[Tensor] | Tensor) -> Tensor:
+def _join_state(state: list[Tensor] | Tensor) -> Tensor:
     """One vector of a state, which is a list before the processes' parts are gathered and a tensor after."""
     return state if isinstance(state, Tensor) else torch.cat([torch.empty(0), *(s.cpu() for s in state)])

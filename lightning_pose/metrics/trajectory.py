@@ -69,12 +69,12 @@ def trajectory_errors(position_hat: Array, quat_hat: Array, position: Array, qua
         ConfigError: shapes do not fit.
         DataError: a true pose is not finite.
     """
-    hat, truth = _checked(position_hat, quat_hat, position, quat)
+    hat, truth = _check_poses(position_hat, quat_hat, position, quat)
     n_poses = len(truth[0])
     if n_poses < 2:
         return dict.fromkeys(METRICS, math.nan)
     finite = all(bool(part.isfinite().all()) for part in hat)
-    errors = _measured(hat, truth) if finite else dict.fromkeys(METRICS, math.inf)
+    errors = _measure_errors(hat, truth) if finite else dict.fromkeys(METRICS, math.inf)
     return errors if n_poses > 2 else errors | {"ate_rmse_m": math.nan}
 
 
@@ -116,13 +116,13 @@ def drift_by_length(
     """
     if min(lengths, default=1) < 1:
         raise ConfigError(f"lengths has {min(lengths)}, but a sub-trajectory has one step at least; give 1 or more")
-    hat, truth = _checked(position_hat, quat_hat, position, quat)
-    rows = [_drift(hat, truth, int(length)) for length in lengths]
+    hat, truth = _check_poses(position_hat, quat_hat, position, quat)
+    rows = [_measure_drift(hat, truth, int(length)) for length in lengths]
     metres, degrees, percent, starts = np.array(rows, float).reshape(len(rows), 4).T
     return Drift(np.array(lengths, int), metres, degrees, percent, starts.astype(int))
 
 
-def _checked(position_hat: Array, quat_hat: Array, position: Array, quat: Array) -> tuple[Poses, Poses]:
+def _check_poses(position_hat: Array, quat_hat: Array, position: Array, quat: Array) -> tuple[Poses, Poses]:
     parts = [torch.as_tensor(part).detach().cpu().double() for part in (position_hat, quat_hat, position, quat)]
     shapes = [tuple(part.shape) for part in parts]
     n_poses = shapes[2][0] if shapes[2] else 0
@@ -134,20 +134,20 @@ def _checked(position_hat: Array, quat_hat: Array, position: Array, quat: Array)
     return (parts[0], quat_normalize(parts[1])), (parts[2], quat_normalize(parts[3]))
 
 
-def _measured(hat: Poses, truth: Poses) -> dict[str, float]:
+def _measure_errors(hat: Poses, truth: Poses) -> dict[str, float]:
     """The four metrics of two finite trajectories of at least two poses."""
     aligned = _align_positions(hat[0].numpy(), truth[0].numpy())
     start = compose_pose(truth[0][0], truth[1][0], *relative_pose(hat[0][0], hat[1][0], hat[0], hat[1]))[0]
     step_hat, step = (relative_pose(p[:-1], q[:-1], p[1:], q[1:]) for p, q in (hat, truth))
     return {
-        "ate_rmse_m": _root_mean_square(np.linalg.norm(aligned - truth[0].numpy(), axis=1)),
-        "ate_origin_rmse_m": _root_mean_square(position_error_m(start, truth[0]).numpy()),
-        "rpe_rmse_m": _root_mean_square(relative_pose(*step, *step_hat)[0].norm(dim=1).numpy()),
-        "rpe_rmse_deg": _root_mean_square(orientation_error_deg(step_hat[1], step[1]).numpy()),
+        "ate_rmse_m": _compute_rms(np.linalg.norm(aligned - truth[0].numpy(), axis=1)),
+        "ate_origin_rmse_m": _compute_rms(position_error_m(start, truth[0]).numpy()),
+        "rpe_rmse_m": _compute_rms(relative_pose(*step, *step_hat)[0].norm(dim=1).numpy()),
+        "rpe_rmse_deg": _compute_rms(orientation_error_deg(step_hat[1], step[1]).numpy()),
     }
 
 
-def _root_mean_square(errors: np.ndarray) -> float:
+def _compute_rms(errors: np.ndarray) -> float:
     return math.sqrt(np.mean(errors**2))
 
 
@@ -164,7 +164,7 @@ def _align_positions(points: np.ndarray, targets: np.ndarray) -> np.ndarray:
     return (points - centre) @ (left @ right).T + target
 
 
-def _drift(hat: Poses, truth: Poses, length: int) -> tuple[float, float, float, int]:
+def _measure_drift(hat: Poses, truth: Poses, length: int) -> tuple[float, float, float, int]:
     """Medians in metres, degrees and percent over all starts, and how many starts there are."""
     count = len(truth[0]) - length
     if count < 1:

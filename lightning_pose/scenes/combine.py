@@ -41,7 +41,7 @@ def join_scenes(train: Sequence[Scene], test: Sequence[Scene]) -> Scene:
     frames: list[Frame] = []
     splits: dict[str, list[np.ndarray]] = {"train": [], "val": [], "test": []}
     for root, scene in known.items():
-        for split, indices in _given(scene, root in trained, root in tested).items():
+        for split, indices in _select_frames(scene, root in trained, root in tested).items():
             splits[split].append(indices + len(frames))
         named = (replace(frame, sequence=f"{scene.name}/{frame.sequence}") for frame in scene.frames)
         frames += named if len(known) > 1 else scene.frames
@@ -50,20 +50,20 @@ def join_scenes(train: Sequence[Scene], test: Sequence[Scene]) -> Scene:
     return replace(
         train[0],
         name=learned if learned == asked else f"{learned} to {asked}",
-        format=_told([scene.format for scene in train], [scene.format for scene in test]),
+        format=_join_values([scene.format for scene in train], [scene.format for scene in test]),
         frames=tuple(frames),
         splits={split: np.concatenate([np.zeros(0, np.int64), *parts]) for split, parts in splits.items()},
         split_source=seen[0].split_source if seen else "unseen",
-        ground_truth=_told([scene.ground_truth for scene in train], [scene.ground_truth for scene in test]),
+        ground_truth=_join_values([scene.ground_truth for scene in train], [scene.ground_truth for scene in test]),
     )
 
 
-def _told(learned: Sequence[str], asked: Sequence[str]) -> str:
+def _join_values(learned: Sequence[str], asked: Sequence[str]) -> str:
     """What scenes say, each value once, those of the scenes tested on last: errors are of these."""
     return "+".join(dict.fromkeys([*(value for value in learned if value not in asked), *asked]))
 
 
-def _given(scene: Scene, trained: bool, tested: bool) -> dict[str, np.ndarray]:
+def _select_frames(scene: Scene, trained: bool, tested: bool) -> dict[str, np.ndarray]:
     """The frames that a scene gives to each split."""
     if trained:
         return {split: scene.splits[split] for split in ("train", "val", *(["test"] if tested else []))}

@@ -88,18 +88,18 @@ def hold_out(
     wanted = max(1, round(fraction * len(indices)))
     if wanted >= len(indices):
         raise ConfigError(f"{setting} {fraction} leaves none of {len(indices)} frames to train on; lower it")
-    held = _halves(indices, sequences[indices], wanted, block)
+    held = _choose_halves(indices, sequences[indices], wanted, block)
     if held is None:
-        held = _whole(indices, sequences[indices], wanted, block)
+        held = _choose_sequences(indices, sequences[indices], wanted, block)
     if held is None:
-        held = _blocks(indices, sequences, wanted, block)
+        held = _choose_blocks(indices, sequences, wanted, block)
     return np.setdiff1d(indices, held), held
 
 
-def _halves(indices: np.ndarray, sequence_of: np.ndarray, wanted: int, block: int) -> np.ndarray | None:
+def _choose_halves(indices: np.ndarray, sequence_of: np.ndarray, wanted: int, block: int) -> np.ndarray | None:
     """Halves of evenly spaced sequences, `wanted` frames or more; None where that takes far too many frames, or a half
     is shorter than a block."""
-    names, lengths = _sequences(sequence_of)
+    names, lengths = _count_sequences(sequence_of)
     half = int(np.median(lengths)) // 2
     if half < block or MAX_BLOCKS * half > 2 * wanted:
         return None
@@ -107,38 +107,38 @@ def _halves(indices: np.ndarray, sequence_of: np.ndarray, wanted: int, block: in
     if count > len(names):
         return None
     held = []
-    for i, place in enumerate(_evenly(count, len(names))):
+    for i, place in enumerate(_space_evenly(count, len(names))):
         members = indices[sequence_of == names[place]]
         middle = len(members) // 2
         held.append(members[middle:] if i % 2 == 0 else members[:middle])
     return np.sort(np.concatenate(held))
 
 
-def _whole(indices: np.ndarray, sequence_of: np.ndarray, wanted: int, block: int) -> np.ndarray | None:
+def _choose_sequences(indices: np.ndarray, sequence_of: np.ndarray, wanted: int, block: int) -> np.ndarray | None:
     """Evenly spaced whole sequences, `wanted` frames or more; None where halves or parts of one are a block as well."""
-    names, lengths = _sequences(sequence_of)
+    names, lengths = _count_sequences(sequence_of)
     length = int(np.median(lengths))
     count = -(-wanted // length)
     if not length // 2 < block <= length or length > 2 * wanted or count >= len(names):
         return None
-    return indices[np.isin(sequence_of, [names[place] for place in _evenly(count, len(names))])]
+    return indices[np.isin(sequence_of, [names[place] for place in _space_evenly(count, len(names))])]
 
 
-def _sequences(sequence_of: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _count_sequences(sequence_of: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Names of sequences as they come in the scene, and how many frames each has."""
     names, first, lengths = np.unique(sequence_of, return_index=True, return_counts=True)
     order = np.argsort(first)
     return names[order], lengths[order]
 
 
-def _blocks(indices: np.ndarray, sequences: np.ndarray, wanted: int, block: int) -> np.ndarray:
+def _choose_blocks(indices: np.ndarray, sequences: np.ndarray, wanted: int, block: int) -> np.ndarray:
     """Evenly spaced blocks, `wanted` frames together, none across a gap or the border of two sequences."""
     breaks = np.flatnonzero((np.diff(indices) > 1) | (sequences[indices[1:]] != sequences[indices[:-1]])) + 1
     runs = np.array([0, *breaks, len(indices)])
     count = min(max(wanted // max(MIN_BLOCK, block), 1), MAX_BLOCKS)
     lengths = [max(block, len(part)) for part in np.array_split(np.arange(wanted), count)]
     held = []
-    for centre, length in zip(_evenly(count, len(indices)), lengths, strict=True):
+    for centre, length in zip(_space_evenly(count, len(indices)), lengths, strict=True):
         run = np.searchsorted(runs, centre, side="right") - 1
         length = min(length, runs[run + 1] - runs[run])
         start = np.clip(centre - length // 2, runs[run], runs[run + 1] - length)
@@ -146,6 +146,6 @@ def _blocks(indices: np.ndarray, sequences: np.ndarray, wanted: int, block: int)
     return np.unique(np.concatenate(held))
 
 
-def _evenly(count: int, total: int) -> list[int]:
+def _space_evenly(count: int, total: int) -> list[int]:
     """The middles of `count` equal parts of 0..total-1."""
     return [(2 * i + 1) * total // (2 * count) for i in range(count)]

@@ -37,11 +37,11 @@ def write_sequences(folder: Path, frames: Iterable[Frame], position_m: np.ndarra
         rows.setdefault(frame.sequence, []).append(i)
     files = []
     for sequence, members in rows.items():
-        times = [_time(frames[i]) for i in members]
+        times = [_find_time(frames[i]) for i in members]
         files.append(folder / f"{sequence.replace('/', '_')}.tum")
         write_tum(files[-1], times, position_m[members], quat_wxyz[members])
     return files
 
 
-def _time(frame: Frame) -> float:
+def _find_time(frame: Frame) -> float:
     return float(frame.index) if frame.timestamp is None else frame.timestamp

@@ -16,7 +16,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from lightning_pose.checkpoint import build, describe
+from lightning_pose.checkpoint import build_object, describe_object
 from lightning_pose.errors import CheckpointError, ConfigError, ImageError
 from lightning_pose.features import CNN, FeatureCache
 from tests.features.helpers import write_images
@@ -268,8 +268,12 @@ def test_cached_map(tmp_path: Path) -> None:
 def test_extractors_can_be_described_copied_and_pickled() -> None:
     extractor = CNN(f"{HERE}.Pixels", output="map", size=32, crop="whole")
     expected = features(extractor, bands())
-    for other in (build(describe(extractor)), copy.deepcopy(extractor), pickle.loads(pickle.dumps(extractor))):
-        assert describe(other) == describe(extractor)
+    for other in (
+        build_object(describe_object(extractor)),
+        copy.deepcopy(extractor),
+        pickle.loads(pickle.dumps(extractor)),
+    ):
+        assert describe_object(other) == describe_object(extractor)
         np.testing.assert_array_equal(features(other, bands()), expected)
 
 

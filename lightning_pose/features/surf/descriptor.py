@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize, pad
 
-__all__ = ["UPRIGHT_ANGLE", "describe", "orientations"]
+__all__ = ["UPRIGHT_ANGLE", "compute_descriptors", "compute_orientations"]
 
 UPRIGHT_ANGLE = 270.0
 """Degrees; the angle of keypoints whose orientation is not looked for."""
@@ -23,7 +23,9 @@ CELLS = 21
 """Cells on a side of the window; each of the 20 x 20 samples is a Haar response of 2 x 2 of them."""
 
 
-def describe(integral: Tensor, image: Tensor, xy: Tensor, size: Tensor, angle: Tensor | None = None) -> Tensor:
+def compute_descriptors(
+    integral: Tensor, image: Tensor, xy: Tensor, size: Tensor, angle: Tensor | None = None
+) -> Tensor:
     """(K, 64) L2-normalised descriptors.
 
     Args:
@@ -35,10 +37,10 @@ def describe(integral: Tensor, image: Tensor, xy: Tensor, size: Tensor, angle: T
     """
     window = torch.div(size * 14, 5, rounding_mode="floor")  # 21 * 1.2 / 9 of the size, free of rounding errors
     if angle is None:
-        patch = _upright_patch(integral, image, xy, window)
+        patch = _sample_upright_patch(integral, image, xy, window)
     else:
-        patch = _rotated_patch(integral, image, xy, window, torch.deg2rad(angle))
-    filters = _filters(integral.device)
+        patch = _sample_rotated_patch(integral, image, xy, window, torch.deg2rad(angle))
+    filters = _make_filters(integral.device)
     smooth, change = (filters @ patch.flatten(1)).view(2, CELLS - 1, CELLS, -1)
     dx, dy = filters[CELLS - 1 :] @ smooth, filters[: CELLS - 1] @ change
     responses = torch.stack([dx, dy, dx.abs(), dy.abs()], 2)  # (across, along, 4, K)
@@ -46,21 +48,21 @@ def describe(integral: Tensor, image: Tensor, xy: Tensor, size: Tensor, angle: T
     return normalize(fields.flatten(0, 2).T)
 
 
-def orientations(integral: Tensor, image: Tensor, xy: Tensor, size: Tensor) -> Tensor:
+def compute_orientations(integral: Tensor, image: Tensor, xy: Tensor, size: Tensor) -> Tensor:
     """(K,) dominant gradient directions, degrees in 0..360: the strongest 60-degree sector of a disc.
 
-    Args: as for `describe`. Samples whose wavelet leaves the image are left out.
+    Args: as for `compute_descriptors`. Samples whose wavelet leaves the image are left out.
     """
-    disc, weight = _disc(integral.device)
+    disc, weight = _make_disc(integral.device)
     scale = size * (1.2 / 9)
     half = torch.round(2 * scale)  # half the wavelet's side
     corner = torch.round(xy.T[:, None] + disc[..., None] * scale - (half - 0.5))  # (2, 113, K)
     limit = torch.tensor([integral.shape[2], integral.shape[1]], device=xy.device).view(2, 1, 1) - 2 * half
     inside = ((corner >= 0) & (corner < limit)).all(0)
     x, y = (corner * inside)[:, None] + half * torch.arange(3, device=xy.device).view(3, 1, 1)
-    sums = _sums(integral, image.repeat(len(weight)), y.flatten(1), x.flatten(1)).unflatten(2, inside.shape)
-    dx = _second_difference(sums[2] - sums[0]) * weight[:, None] * inside
-    dy = _second_difference(sums[:, 2] - sums[:, 0]) * weight[:, None] * inside
+    sums = _sample_integral(integral, image.repeat(len(weight)), y.flatten(1), x.flatten(1)).unflatten(2, inside.shape)
+    dx = _compute_second_difference(sums[2] - sums[0]) * weight[:, None] * inside
+    dy = _compute_second_difference(sums[:, 2] - sums[:, 0]) * weight[:, None] * inside
 
     degree = torch.round(torch.rad2deg(torch.atan2(dy, dx))).long() % 360
     histogram = dx.new_zeros((2, 360, len(xy))).scatter_add_(1, degree.expand(2, -1, -1), torch.stack([dx, dy]))
@@ -72,21 +74,21 @@ def orientations(integral: Tensor, image: Tensor, xy: Tensor, size: Tensor) -> T
     return torch.rad2deg(torch.atan2(y, x)) % 360
 
 
-def _second_difference(a: Tensor) -> Tensor:
+def _compute_second_difference(a: Tensor) -> Tensor:
     return a[0] - 2 * a[1] + a[2]
 
 
-def _upright_patch(integral: Tensor, image: Tensor, xy: Tensor, window: Tensor) -> Tensor:
+def _sample_upright_patch(integral: Tensor, image: Tensor, xy: Tensor, window: Tensor) -> Tensor:
     """(21, 21, K) grey sums of cells, to the right and upwards, as OpenCV places whole pixels."""
     x, y = xy.unbind(1)
     half = (window - 1) / 2
     edge = torch.arange(CELLS + 1, device=xy.device)[:, None] * (window / CELLS)
-    sums = _sums(integral, image, torch.round(y + half) + 1 - edge, torch.round(x - half) + edge)
+    sums = _sample_integral(integral, image, torch.round(y + half) + 1 - edge, torch.round(x - half) + edge)
     columns = sums[:-1] - sums[1:]
     return (columns[:, 1:] - columns[:, :-1]).transpose(0, 1)
 
 
-def _rotated_patch(integral: Tensor, image: Tensor, xy: Tensor, window: Tensor, angle: Tensor) -> Tensor:
+def _sample_rotated_patch(integral: Tensor, image: Tensor, xy: Tensor, window: Tensor, angle: Tensor) -> Tensor:
     """(21, 21, K) grey sums around the centres of rotated cells, across and along the angle.
 
     The cells themselves stay parallel to the image, so that integral images serve.
@@ -97,19 +99,19 @@ def _rotated_patch(integral: Tensor, image: Tensor, xy: Tensor, window: Tensor, 
     edges = torch.stack([-cell, cell])[:, None, None] / 2 + 0.5
     x = edges + (xy[:, 0] + v * cos - u * sin)
     y = edges + (xy[:, 1] + v * sin + u * cos)
-    sums = _sums(integral, image.repeat(CELLS * CELLS), y.flatten(1), x.flatten(1))
+    sums = _sample_integral(integral, image.repeat(CELLS * CELLS), y.flatten(1), x.flatten(1))
     return (sums[1, 1] - sums[0, 1] - sums[1, 0] + sums[0, 0]).view(CELLS, CELLS, -1)
 
 
-def _sums(integral: Tensor, image: Tensor, y: Tensor, x: Tensor) -> Tensor:
+def _sample_integral(integral: Tensor, image: Tensor, y: Tensor, x: Tensor) -> Tensor:
     """(R, C, K) integrals at R fractional rows and C columns of each of K places, up to terms of one axis.
 
     What depends on the row alone or on the column alone drops out of every box sum; without it the
     numbers are small enough for float32. Outside the image the border pixels are repeated.
     """
     plane, line, _ = integral.stride()
-    rows, down = _lattice(y, integral.shape[1])
-    cols, across = _lattice(x, integral.shape[2])
+    rows, down = _find_lattice_cells(y, integral.shape[1])
+    cols, across = _find_lattice_cells(x, integral.shape[2])
     index = (rows * line + (image * plane).int())[:, None] + cols
     sums = integral.view(-1).index_select(0, index.view(-1)).view(index.shape)
     sums = (sums - sums[:1]).sub_(sums[:, :1] - sums[:1, :1]).float()
@@ -117,7 +119,7 @@ def _sums(integral: Tensor, image: Tensor, y: Tensor, x: Tensor) -> Tensor:
     return torch.lerp(sums[:, : len(x)], sums[:, len(x) :], across)
 
 
-def _lattice(position: Tensor, length: int) -> tuple[Tensor, Tensor]:
+def _find_lattice_cells(position: Tensor, length: int) -> tuple[Tensor, Tensor]:
     """Lattice neighbours (2 * E, K) int32 below and above each position; fraction (E, K) between them.
 
     Beyond the ends the neighbours stay and the fraction leaves 0..1: linear extrapolation.
@@ -128,7 +130,7 @@ def _lattice(position: Tensor, length: int) -> tuple[Tensor, Tensor]:
 
 
 @lru_cache(maxsize=4)
-def _filters(device: torch.device) -> Tensor:
+def _make_filters(device: torch.device) -> Tensor:
     """(40, 21) Gaussian-weighted: 20 sums of two neighbouring cells, then the 20 changes between them."""
     cells = torch.eye(CELLS)
     i = torch.arange(CELLS - 1) - (CELLS - 2) / 2
@@ -137,7 +139,7 @@ def _filters(device: torch.device) -> Tensor:
 
 
 @lru_cache(maxsize=4)
-def _disc(device: torch.device) -> tuple[Tensor, Tensor]:
+def _make_disc(device: torch.device) -> tuple[Tensor, Tensor]:
     """(2, 113) lattice points x, y within a radius of 6, and their (113,) Gaussian weights."""
     points = torch.cartesian_prod(*[torch.arange(-6, 7)] * 2).T
     square = points.square().sum(0)

@@ -17,9 +17,9 @@ from torch import Tensor
 
 from lightning_pose.errors import ConfigError, ImageError
 from lightning_pose.features.base import LocalExtractor, Record
-from lightning_pose.features.surf.descriptor import UPRIGHT_ANGLE, describe, orientations
-from lightning_pose.features.surf.detector import detect
-from lightning_pose.features.surf.hessian import integral_image
+from lightning_pose.features.surf.descriptor import UPRIGHT_ANGLE, compute_descriptors, compute_orientations
+from lightning_pose.features.surf.detector import detect_keypoints
+from lightning_pose.features.surf.hessian import compute_integral_image
 
 __all__ = ["SURF", "SurfFeatures"]
 
@@ -79,7 +79,7 @@ class SURF(LocalExtractor):
         Raises:
             ImageError: another number of axes, no pixels, another type, or floats outside 0..1.
         """
-        return self._run(_as_uint8(images), self.n_features)
+        return self._run(_convert_to_uint8(images), self.n_features)
 
     @torch.no_grad()
     def extract(self, images: Sequence[np.ndarray]) -> list[Record]:
@@ -128,19 +128,19 @@ class SURF(LocalExtractor):
         return SurfFeatures(*(torch.cat(column) for column in zip(*chunks, strict=True)))
 
     def _chunk(self, gray: Tensor, n: int) -> SurfFeatures:
-        integral = integral_image(gray)
-        found = detect(integral, n, self.threshold)
+        integral = compute_integral_image(gray)
+        found = detect_keypoints(integral, n, self.threshold)
         image = torch.arange(len(gray), device=gray.device).repeat_interleave(n)
         xy, size = found.xy.flatten(0, 1), found.size.flatten()
-        angle = None if self.upright else orientations(integral, image, xy, size)
-        descriptors = describe(integral, image, xy, size, angle).unflatten(0, (len(gray), n))
+        angle = None if self.upright else compute_orientations(integral, image, xy, size)
+        descriptors = compute_descriptors(integral, image, xy, size, angle).unflatten(0, (len(gray), n))
         degrees = torch.full_like(size, UPRIGHT_ANGLE) if angle is None else angle
         degrees = degrees.view_as(found.size) * (found.size > 0)
         columns = torch.stack([found.size, found.response, degrees], -1)
         return SurfFeatures(torch.cat([found.xy, columns], -1), descriptors, found.count)
 
 
-def _as_uint8(images: Tensor) -> Tensor:
+def _convert_to_uint8(images: Tensor) -> Tensor:
     if images.ndim != 3 or 0 in images.shape[1:]:
         raise ImageError(
             f"the images have shape {tuple(images.shape)}; give (B, H, W) grayscale (one image: image[None])"

@@ -48,24 +48,24 @@ def load_scene(
     root = Path(root).expanduser()
     if not root.is_dir():
         raise DataError(f"{root} is not a folder; give the folder of a scene")
-    scene = _format(root, format).read(root)
+    scene = _choose_format(root, format).read(root)
     source = "official" if scene.splits else "blocks"
     return replace(scene, splits=make_splits(scene, val_fraction, test_fraction, val_block), split_source=source)
 
 
-def _format(root: Path, name: str | None) -> SceneFormat:
+def _choose_format(root: Path, name: str | None) -> SceneFormat:
     """The format of that name, or the only one that the folder matches."""
     formats = known_formats()
     if name is not None:
         if name not in formats:
             raise ConfigError(f"format {name!r} is unknown; the formats are {', '.join(sorted(formats))}")
         return formats[name]
-    matching = _matching(root)
+    matching = _find_matching_formats(root)
     if len(matching) > 1:
         raise DataError(f"{root} may be {' or '.join(matching)}; say which with `format`")
     if matching:
         return formats[matching[0]]
-    scenes = [child.name for child in sorted(root.iterdir()) if child.is_dir() and _matching(child)]
+    scenes = [child.name for child in sorted(root.iterdir()) if child.is_dir() and _find_matching_formats(child)]
     if scenes:
         raise DataError(f"{root} is no dataset itself but holds {', '.join(scenes)}; give one of these")
     looked = "; ".join(f"{format.name}: {format.looks_for}" for format in formats.values())
@@ -75,5 +75,5 @@ def _format(root: Path, name: str | None) -> SceneFormat:
     )
 
 
-def _matching(root: Path) -> list[str]:
+def _find_matching_formats(root: Path) -> list[str]:
     return [name for name, format in known_formats().items() if format.matches(root)]

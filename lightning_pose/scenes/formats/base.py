@@ -17,11 +17,11 @@ from lightning_pose.scenes.scene import Frame, Scene
 __all__ = [
     "SceneFormat",
     "natural_key",
-    "ordered",
     "poses_from_matrices",
     "read_lines",
     "read_table",
     "require_images",
+    "sort_frames",
     "unit_quats",
 ]
 
@@ -119,17 +119,17 @@ def poses_from_matrices(T_world_cam: np.ndarray, where: Sequence[str]) -> tuple[
             or mirrored.
     """
     finite = np.isfinite(T_world_cam).sum(axis=(1, 2))
-    _refuse(finite < 16, where, T_world_cam, "the pose has NaN or infinite entries ({}); remove the frame")
+    _raise_if_any(finite < 16, where, T_world_cam, "the pose has NaN or infinite entries ({}); remove the frame")
     bottom = T_world_cam[:, 3]
     off = np.abs(bottom - [0, 0, 0, 1]).max(axis=1)
-    _refuse(off > 1e-6, where, bottom, "the last row is {}, not 0 0 0 1; give a 4x4 camera-to-world matrix")
+    _raise_if_any(off > 1e-6, where, bottom, "the last row is {}, not 0 0 0 1; give a 4x4 camera-to-world matrix")
     R = T_world_cam[:, :3, :3]
     det = np.linalg.det(R)
-    _refuse(det < 0, where, det, "the rotation is mirrored (determinant {}); give right-handed axes")
+    _raise_if_any(det < 0, where, det, "the rotation is mirrored (determinant {}); give right-handed axes")
     skew = np.abs(R.swapaxes(1, 2) @ R - np.eye(3)).max(axis=(1, 2))
-    _refuse(skew > MAX_SKEW, where, skew, "the 3x3 is no rotation (R^T R is off by {}); correct the pose")
+    _raise_if_any(skew > MAX_SKEW, where, skew, "the 3x3 is no rotation (R^T R is off by {}); correct the pose")
     U, _, Vt = np.linalg.svd(R)
-    return T_world_cam[:, :3, 3], _canonical(Rotation.from_matrix(U @ Vt))
+    return T_world_cam[:, :3, 3], _make_canonical_quats(Rotation.from_matrix(U @ Vt))
 
 
 def unit_quats(quats: np.ndarray, where: Sequence[str], scalar_first: bool) -> np.ndarray:
@@ -140,8 +140,8 @@ def unit_quats(quats: np.ndarray, where: Sequence[str], scalar_first: bool) -> n
     """
     norms = np.linalg.norm(quats, axis=1)
     off = np.abs(norms - 1)
-    _refuse(off > 0.1, where, norms, "the quaternion's norm is {}, not 1; check the order of the columns")
-    return _canonical(Rotation.from_quat(quats, scalar_first=scalar_first))
+    _raise_if_any(off > 0.1, where, norms, "the quaternion's norm is {}, not 1; check the order of the columns")
+    return _make_canonical_quats(Rotation.from_quat(quats, scalar_first=scalar_first))
 
 
 def require_images(paths: Iterable[Path], listed_in: str) -> None:
@@ -159,17 +159,17 @@ def natural_key(text: str) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", text)]
 
 
-def ordered(frames: Iterable[Frame]) -> tuple[Frame, ...]:
+def sort_frames(frames: Iterable[Frame]) -> tuple[Frame, ...]:
     """Frames in the order that a Scene wants: sequence by sequence, by index within each."""
     return tuple(sorted(frames, key=lambda frame: (natural_key(frame.sequence), frame.index)))
 
 
-def _canonical(rotation: Rotation) -> np.ndarray:
+def _make_canonical_quats(rotation: Rotation) -> np.ndarray:
     """w >= 0: q and -q are one rotation, and comparing files must not depend on which one was written."""
     return rotation.as_quat(canonical=True, scalar_first=True)
 
 
-def _refuse(bad: np.ndarray, where: Sequence[str], values: np.ndarray, complaint: str) -> None:
+def _raise_if_any(bad: np.ndarray, where: Sequence[str], values: np.ndarray, complaint: str) -> None:
     """Raise DataError with the place and the value of the first bad row, if there is one."""
     for i in np.flatnonzero(bad)[:1]:
         value = np.array2string(values[i], precision=6).replace("\n", "")

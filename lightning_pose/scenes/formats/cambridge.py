@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lightning_pose.errors import DataError
-from lightning_pose.scenes.formats.base import SceneFormat, ordered, read_lines, require_images, unit_quats
+from lightning_pose.scenes.formats.base import SceneFormat, read_lines, require_images, sort_frames, unit_quats
 from lightning_pose.scenes.scene import Frame, Scene
 
 __all__ = ["FORMAT", "Cambridge"]
@@ -37,8 +37,8 @@ class Cambridge(SceneFormat):
         return all((root / file).is_file() for file in SPLIT_FILES.values())
 
     def read(self, root: Path) -> Scene:
-        rows = {split: _read_list(root / file) for split, file in SPLIT_FILES.items()}
-        frames, split_of = _frames(root, rows)
+        rows = {split: _read_pose_list(root / file) for split, file in SPLIT_FILES.items()}
+        frames, split_of = _make_frames(root, rows)
         splits = {
             split: np.array([i for i, frame in enumerate(frames) if split_of[frame.image] == split], dtype=int)
             for split in SPLIT_FILES
@@ -55,7 +55,7 @@ Row = tuple[str, list[float], str]
 """Image, its seven numbers, and the place in the file."""
 
 
-def _read_list(path: Path) -> list[Row]:
+def _read_pose_list(path: Path) -> list[Row]:
     rows = []
     for number, line in read_lines(path):
         if number <= HEADER_LINES:
@@ -74,7 +74,7 @@ def _read_list(path: Path) -> list[Row]:
     return rows
 
 
-def _frames(root: Path, rows: dict[str, list[Row]]) -> tuple[tuple[Frame, ...], dict[Path, str]]:
+def _make_frames(root: Path, rows: dict[str, list[Row]]) -> tuple[tuple[Frame, ...], dict[Path, str]]:
     """The frames of both lists, ordered, and the split of each image."""
     split_of: dict[Path, str] = {}
     for split, listed in rows.items():
@@ -86,15 +86,13 @@ def _frames(root: Path, rows: dict[str, list[Row]]) -> tuple[tuple[Frame, ...], 
     poses = np.array([pose for _, pose, _ in listed]).reshape(-1, 7)
     quats = unit_quats(poses[:, 3:], [place for *_, place in listed], scalar_first=True)
     quats = Rotation.from_quat(quats, scalar_first=True).inv().as_quat(canonical=True, scalar_first=True)
-    kept = _near_median(root, poses[:, :3])
-    frames = [
-        Frame(root / listed[i][0], poses[i, :3], quats[i], *_sequence_and_index(root, listed[i][0])) for i in kept
-    ]
+    kept = _keep_near_median(root, poses[:, :3])
+    frames = [Frame(root / listed[i][0], poses[i, :3], quats[i], *_parse_image_path(root, listed[i][0])) for i in kept]
     require_images((frame.image for frame in frames), " or ".join(SPLIT_FILES.values()))
-    return ordered(frames), split_of
+    return sort_frames(frames), split_of
 
 
-def _near_median(root: Path, positions_m: np.ndarray) -> np.ndarray:
+def _keep_near_median(root: Path, positions_m: np.ndarray) -> np.ndarray:
     """Rows within MAX_DISTANCE_M of the median position."""
     if not len(positions_m):
         return np.array([], dtype=int)
@@ -106,7 +104,7 @@ def _near_median(root: Path, positions_m: np.ndarray) -> np.ndarray:
     return kept
 
 
-def _sequence_and_index(root: Path, image: str) -> tuple[str, int]:
+def _parse_image_path(root: Path, image: str) -> tuple[str, int]:
     """`seq1/frame00012.png` -> `seq1`, 12."""
     path = PurePosixPath(image)
     number = re.search(r"\d+", path.stem)

@@ -19,7 +19,7 @@ from lightning_pose.scenes.formats.base import (
 from lightning_pose.scenes.formats.tum import TRAJECTORY_COLUMNS, is_numbered
 from lightning_pose.scenes.scene import Frame, Intrinsics, Scene
 
-__all__ = ["FORMAT", "IclNuim", "reflect"]
+__all__ = ["FORMAT", "IclNuim", "reflect_poses"]
 
 log = logging.getLogger("lightning_pose")
 
@@ -44,10 +44,10 @@ class IclNuim(SceneFormat):
     looks_for = "*.gt.freiburg (or groundtruth.txt with frame numbers) and rgb/N.png"
 
     def matches(self, root: Path) -> bool:
-        return (root / "rgb").is_dir() and _trajectory(root) is not None
+        return (root / "rgb").is_dir() and _find_trajectory(root) is not None
 
     def read(self, root: Path) -> Scene:
-        trajectory = _trajectory(root)
+        trajectory = _find_trajectory(root)
         if trajectory is None:
             raise DataError(f"{root} has no *.gt.freiburg and no numbered groundtruth.txt; add one")
         if trajectory.name == "groundtruth.txt":
@@ -57,7 +57,7 @@ class IclNuim(SceneFormat):
             )
         table, where = read_table(trajectory, TRAJECTORY_COLUMNS.replace("timestamp", "frame"))
         row_of = {int(number): row for row, number in enumerate(table[:, 0])}
-        images = _images(root)
+        images = _find_images(root)
         posed = sorted(images.keys() & row_of.keys())
         if not posed:
             raise DataError(f"{root}: no image's number is in {trajectory.name}; name them rgb/1.png ...")
@@ -65,7 +65,7 @@ class IclNuim(SceneFormat):
             log.warning("%s: dropped %d of %d images, no pose", root, len(images) - len(posed), len(images))
         require_images((images[number] for number in posed), "the image list")
         rows = [row_of[number] for number in posed]
-        positions, quats = reflect(table[rows, 1:4], unit_quats(table[:, 4:], where, scalar_first=False)[rows])
+        positions, quats = reflect_poses(table[rows, 1:4], unit_quats(table[:, 4:], where, scalar_first=False)[rows])
         name = root.resolve().name
         frames = tuple(
             Frame(images[number], position, quat, name, number, number / FRAMES_PER_SECOND, CAMERA)
@@ -77,7 +77,7 @@ class IclNuim(SceneFormat):
 FORMAT = IclNuim()
 
 
-def reflect(positions_m: np.ndarray, quats_wxyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def reflect_poses(positions_m: np.ndarray, quats_wxyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """S T S with S = diag(1, -1, 1, 1): the same poses with the y axes of world and camera turned over.
 
     The position (x, y, z) becomes (x, -y, z). A rotation's axis is an axial vector, so a mirror flips the
@@ -90,7 +90,7 @@ def reflect(positions_m: np.ndarray, quats_wxyz: np.ndarray) -> tuple[np.ndarray
     return positions_m * [1, -1, 1], quats_wxyz * [1, -1, 1, -1]
 
 
-def _trajectory(root: Path) -> Path | None:
+def _find_trajectory(root: Path) -> Path | None:
     """The file with the poses; the first by name if there are several, as they would be one to a folder."""
     published = sorted(root.glob("*.gt.freiburg"))
     ours = root / "groundtruth.txt"
@@ -99,7 +99,7 @@ def _trajectory(root: Path) -> Path | None:
     return ours if ours.is_file() and is_numbered(ours) else None
 
 
-def _images(root: Path) -> dict[int, Path]:
+def _find_images(root: Path) -> dict[int, Path]:
     """Number -> image."""
     lists = [root / name for name in ("associations.txt", "rgb.txt") if (root / name).is_file()]
     if lists:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from lightning_pose.errors import DataError
-from lightning_pose.scenes.formats.base import SceneFormat, ordered, poses_from_matrices, read_lines
+from lightning_pose.scenes.formats.base import SceneFormat, poses_from_matrices, read_lines, sort_frames
 from lightning_pose.scenes.scene import Frame, Intrinsics, Scene
 
 __all__ = ["FORMAT", "SevenScenes"]
@@ -34,9 +34,9 @@ class SevenScenes(SceneFormat):
         return all((root / file).is_file() for file in SPLIT_FILES.values())
 
     def read(self, root: Path) -> Scene:
-        split_of = _split_of_sequences(root)
-        intrinsics = _intrinsics(root)
-        frames = ordered(frame for sequence in split_of for frame in _read_sequence(root / sequence, intrinsics))
+        split_of = _read_split_files(root)
+        intrinsics = _read_intrinsics(root)
+        frames = sort_frames(frame for sequence in split_of for frame in _read_sequence(root / sequence, intrinsics))
         splits = {
             split: np.array([i for i, frame in enumerate(frames) if split_of[frame.sequence] == split])
             for split in SPLIT_FILES
@@ -48,7 +48,7 @@ class SevenScenes(SceneFormat):
 FORMAT = SevenScenes()
 
 
-def _split_of_sequences(root: Path) -> dict[str, str]:
+def _read_split_files(root: Path) -> dict[str, str]:
     """Folder name of each listed sequence -> its split."""
     split_of: dict[str, str] = {}
     for split, file in SPLIT_FILES.items():
@@ -102,7 +102,7 @@ def _read_matrix(path: Path) -> np.ndarray:
         raise DataError(f"{path}: not a 4x4 matrix of numbers ({error}); restore the original") from error
 
 
-def _intrinsics(root: Path) -> Intrinsics:
+def _read_intrinsics(root: Path) -> Intrinsics:
     path = root / "synthetic.json"
     if not path.is_file():
         return COLOUR

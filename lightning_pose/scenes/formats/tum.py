@@ -11,7 +11,7 @@ from lightning_pose.errors import DataError
 from lightning_pose.scenes.formats.base import SceneFormat, read_lines, read_table, require_images, unit_quats
 from lightning_pose.scenes.scene import Frame, Intrinsics, Scene
 
-__all__ = ["FORMAT", "TRAJECTORY_COLUMNS", "Tum", "associate", "is_numbered"]
+__all__ = ["FORMAT", "TRAJECTORY_COLUMNS", "Tum", "is_numbered", "pair_by_time"]
 
 log = logging.getLogger("lightning_pose")
 
@@ -40,13 +40,14 @@ class Tum(SceneFormat):
         return (root / "rgb.txt").is_file() and trajectory.is_file() and not is_numbered(trajectory)
 
     def read(self, root: Path) -> Scene:
-        times, images = _read_list(root / "rgb.txt")
+        times, images = _read_image_list(root / "rgb.txt")
         table, where = read_table(root / "groundtruth.txt", TRAJECTORY_COLUMNS)
-        pairs = associate(times, table[:, 0])
+        pairs = pair_by_time(times, table[:, 0])
         if not len(pairs):
             raise DataError(
                 f"{root}: none of the {len(times)} images has a pose within 20 ms; "
-                f"rgb.txt spans {_span(times)}, groundtruth.txt {_span(table[:, 0])}; bring both to one clock"
+                f"rgb.txt spans {_format_span(times)}, groundtruth.txt {_format_span(table[:, 0])}; "
+                "bring both to one clock"
             )
         if len(pairs) < len(times):
             log.warning("%s: dropped %d of %d images, no pose within 20 ms", root, len(times) - len(pairs), len(times))
@@ -64,7 +65,7 @@ class Tum(SceneFormat):
 FORMAT = Tum()
 
 
-def associate(times: np.ndarray, pose_times: np.ndarray) -> np.ndarray:
+def pair_by_time(times: np.ndarray, pose_times: np.ndarray) -> np.ndarray:
     """Pair images with poses by time: the closest pairs first, each image and each pose at most once.
 
     Args:
@@ -96,7 +97,7 @@ def is_numbered(trajectory: Path) -> bool:
     )
 
 
-def _read_list(path: Path) -> tuple[np.ndarray, list[str]]:
+def _read_image_list(path: Path) -> tuple[np.ndarray, list[str]]:
     """Times in seconds, ascending, and the image paths as listed."""
     entries = []
     for number, line in read_lines(path):
@@ -111,5 +112,5 @@ def _read_list(path: Path) -> tuple[np.ndarray, list[str]]:
     return np.array([time for time, _ in entries]), [image for _, image in entries]
 
 
-def _span(times: np.ndarray) -> str:
+def _format_span(times: np.ndarray) -> str:
     return f"{times.min():.3f} to {times.max():.3f} s" if len(times) else "nothing"

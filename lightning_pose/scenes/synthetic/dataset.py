@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from lightning_pose.errors import ConfigError, DataError
-from lightning_pose.scenes.synthetic.render import Renderer, pinhole
+from lightning_pose.scenes.synthetic.render import Renderer, make_camera
 from lightning_pose.scenes.synthetic.room import make_room
 from lightning_pose.scenes.synthetic.trajectory import Walk, is_test, make_walks
 
@@ -58,16 +58,16 @@ def render_room(
         ConfigError: seed, frames or size is out of range.
         DataError: root holds something else, or cannot be written.
     """
-    _check(seed, frames, size)
+    _check_arguments(seed, frames, size)
     root = Path(root)
     metadata = {
         "seed": seed,
         "frames": frames,
         "size": list(size),
         "renderer_version": RENDERER_VERSION,
-        "intrinsics": asdict(pinhole(size)),
+        "intrinsics": asdict(make_camera(size)),
     }
-    if _holds(root, metadata):
+    if _holds_room(root, metadata):
         return root
     try:
         root.parent.mkdir(parents=True, exist_ok=True)
@@ -79,7 +79,7 @@ def render_room(
                 partial.rename(root)
             except OSError:
                 # Another process may have finished the same room first; then its copy is as good.
-                if not _holds(root, metadata):
+                if not _holds_room(root, metadata):
                     raise
     except OSError as error:
         raise DataError(f"cannot write the room to {root}: {error}; give a folder that can be written") from error
@@ -92,7 +92,7 @@ def sequence_lengths(frames: int) -> list[int]:
     return [len(part) for part in np.array_split(np.arange(frames), count)]
 
 
-def _check(seed: int, frames: int, size: tuple[int, int]) -> None:
+def _check_arguments(seed: int, frames: int, size: tuple[int, int]) -> None:
     if seed < 0:
         raise ConfigError(f"seed is {seed}; give a whole number of 0 or more")
     if frames < MIN_FRAMES:
@@ -104,7 +104,7 @@ def _check(seed: int, frames: int, size: tuple[int, int]) -> None:
         raise ConfigError(f"size is {size[0]}x{size[1]}; give a width and height from {low} to {high} pixels")
 
 
-def _holds(root: Path, metadata: dict) -> bool:
+def _holds_room(root: Path, metadata: dict) -> bool:
     """Whether root holds this very room; False if it is absent or empty.
 
     Raises:
@@ -127,7 +127,7 @@ def _write_room(
     root: Path, seed: int, frames: int, size: tuple[int, int], progress: Callable[[int, int], None] | None
 ) -> None:
     room, lengths = make_room(seed), sequence_lengths(frames)
-    renderer = Renderer(room.quads, pinhole(size), size)
+    renderer = Renderer(room.quads, make_camera(size), size)
     walks = make_walks(seed, room.size_m, lengths)
     root.mkdir()
     for name, held_out in (("TrainSplit.txt", False), ("TestSplit.txt", True)):
@@ -148,7 +148,7 @@ def _write_room(
 def _write_frame(renderer: Renderer, folder: Path, walk: Walk, seed: list[int], frame: int) -> None:
     moments = frame + SHUTTER * (np.arange(4) - 1.5) / 4
     image = renderer.render(np.array([walk.pose(moment) for moment in moments]))
-    image = _expose(image, np.random.default_rng([*seed, frame]), np.random.default_rng(seed), frame)
+    image = _add_sensor_effects(image, np.random.default_rng([*seed, frame]), np.random.default_rng(seed), frame)
     stem = folder / f"frame-{frame:06d}"
     ok, png = cv2.imencode(".png", image)
     if not ok:
@@ -157,7 +157,7 @@ def _write_frame(renderer: Renderer, folder: Path, walk: Walk, seed: list[int], 
     np.savetxt(f"{stem}.pose.txt", walk.pose(frame), fmt="%.9f")
 
 
-def _expose(
+def _add_sensor_effects(
     image: np.ndarray, frame_rng: np.random.Generator, sequence_rng: np.random.Generator, frame: int
 ) -> np.ndarray:
     """The sensor: a gain and white balance that drift along the sequence, shot and read noise, 8 bits."""

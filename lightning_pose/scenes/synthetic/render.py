@@ -10,7 +10,7 @@ import numpy as np
 from lightning_pose.scenes.scene import Intrinsics
 from lightning_pose.scenes.synthetic.room import Quad
 
-__all__ = ["SUBSAMPLES", "Renderer", "pinhole"]
+__all__ = ["SUBSAMPLES", "Renderer", "make_camera"]
 
 SUBSAMPLES = np.array([(-3, -1), (1, -3), (3, 1), (-1, 3)]) / 8
 """Offsets in pixels at which each pixel is sampled: a rotated grid."""
@@ -19,7 +19,7 @@ _ATLAS_WIDTH = 4096
 _LEVELS = 7
 
 
-def pinhole(size: tuple[int, int]) -> Intrinsics:
+def make_camera(size: tuple[int, int]) -> Intrinsics:
     """The camera of every room: 63 degrees of horizontal view, as in 7-Scenes; pixel centres at integers."""
     width, height = size
     focal = 525 / 640 * width
@@ -43,7 +43,7 @@ class Renderer:
         self._camera, self._size = camera, size
         self._corners = np.array([q.corner for q in quads])
         self._edges = np.stack([[q.u for q in quads], [q.v for q in quads]], axis=-1)
-        self._atlas, self._places = _pack([_pyramid(q.texture) for q in quads])
+        self._atlas, self._places = _pack_atlas([_build_pyramid(q.texture) for q in quads])
 
     def render(self, T_world_cam: np.ndarray) -> np.ndarray:
         """One exposure.
@@ -71,7 +71,7 @@ class Renderer:
         M = rotation.T @ np.concatenate([self._edges, (self._corners - center)[..., None]], axis=-1)
         # Positive where the camera is on the visible side; near zero where it sees the rectangle edge on.
         facing = np.linalg.det(M)
-        windows = _windows(M, x, y)
+        windows = _find_windows(M, x, y)
         visible = np.flatnonzero((facing > 1e-6) & (windows[:, ::2] < windows[:, 1::2]).all(1))
         inverses = np.zeros_like(M)
         inverses[visible] = np.linalg.inv(M[visible])
@@ -80,7 +80,7 @@ class Renderer:
         for q in visible:
             top, bottom, left, right = windows[q]
             window = slice(top, bottom), slice(left, right)
-            s, t, inv_z = _affine(inverses[q], x[window[1]], y[window[0]])
+            s, t, inv_z = _evaluate_affine(inverses[q], x[window[1]], y[window[0]])
             slack = 1e-4 * inv_z  # closes the cracks that rounding opens between neighbours
             wins = (inv_z > nearest[window]) & (s >= -slack) & (t >= -slack)
             wins &= (s <= inv_z + slack) & (t <= inv_z + slack)
@@ -113,7 +113,7 @@ class Renderer:
         return cv2.remap(self._atlas, map_x, map_y, cv2.INTER_LINEAR)
 
 
-def _windows(M: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def _find_windows(M: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """(Q, 4) first and past-last row and column of each rectangle: all of them if it reaches behind the
     camera, none if it is wholly there."""
     corners = M @ np.array([(0, 1, 1, 0), (0, 0, 1, 1), (1, 1, 1, 1)])
@@ -128,13 +128,13 @@ def _windows(M: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.stack(edges, axis=1)
 
 
-def _affine(inverse: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
+def _evaluate_affine(inverse: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
     """The three rows of M^-1 (x, y, 1) over a grid of rays."""
     a = inverse.astype(np.float32)
     return tuple(a[i, 0] * x + (a[i, 1] * y + a[i, 2])[:, None] for i in range(3))
 
 
-def _pyramid(texture: np.ndarray) -> list[np.ndarray]:
+def _build_pyramid(texture: np.ndarray) -> list[np.ndarray]:
     levels = [texture]
     for _ in range(_LEVELS - 1):
         h, w = levels[-1].shape[:2]
@@ -142,7 +142,7 @@ def _pyramid(texture: np.ndarray) -> list[np.ndarray]:
     return levels
 
 
-def _pack(pyramids: list[list[np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+def _pack_atlas(pyramids: list[list[np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
     """One image that holds every level of every texture, tallest first on shelves, and where they lie.
 
     Returns:

@@ -43,13 +43,13 @@ class Walk:
     def pose(self, frame: float) -> np.ndarray:
         """(4, 4) camera-to-world at a moment, in frames from the start; x right, y down, z forward."""
         knot = frame / FRAMES_PER_KNOT
-        tremor = _spline(self.tremor, frame / 2)
-        position = _spline(self.position_m, knot) + tremor[:3]
-        forward = _spline(self.target_m, knot) - position
+        tremor = _evaluate_spline(self.tremor, frame / 2)
+        position = _evaluate_spline(self.position_m, knot) + tremor[:3]
+        forward = _evaluate_spline(self.target_m, knot) - position
         forward /= np.linalg.norm(forward)
         right = np.cross(forward, (0, 0, 1))
         right /= np.linalg.norm(right)
-        shake = _rotation(tremor[3:] + np.array([0, 0, 1]) * _spline(self.roll_rad, knot))
+        shake = _make_rotation(tremor[3:] + np.array([0, 0, 1]) * _evaluate_spline(self.roll_rad, knot))
         pose = np.eye(4)
         pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1) @ shake
         pose[:3, 3] = position
@@ -77,18 +77,18 @@ def make_walks(seed: int, size_m: np.ndarray, lengths: list[int]) -> list[Walk]:
     for held_out in (False, True):
         for i in range(len(lengths)):
             if is_test(i) == held_out:
-                knots[i] = _wander(rng, low, high, counts[i], seen, ASIDE_M if held_out else FAR_M)
+                knots[i] = _choose_knots(rng, low, high, counts[i], seen, ASIDE_M if held_out else FAR_M)
                 seen = seen if held_out else np.concatenate([seen, knots[i]])
-    return [_hand_held(rng, knots[i], length) for i, length in enumerate(lengths)]
+    return [_make_walk(rng, knots[i], length) for i, length in enumerate(lengths)]
 
 
-def _hand_held(rng: np.random.Generator, knots: np.ndarray, length: int) -> Walk:
+def _make_walk(rng: np.random.Generator, knots: np.ndarray, length: int) -> Walk:
     roll = np.radians(rng.uniform(-5, 5, (len(knots), 1)))
     tremor = 0.003 * rng.standard_normal((length // 2 + 5, 6))
     return Walk(knots[:, :3], knots[:, 3:], roll, tremor, length)
 
 
-def _wander(
+def _choose_knots(
     rng: np.random.Generator, low: np.ndarray, high: np.ndarray, count: int, seen: np.ndarray, aside_m: float
 ) -> np.ndarray:
     """(count, 6) knots of position and target within bounds, a step apart, turning gently.
@@ -117,7 +117,7 @@ def _wander(
     return np.array(knots)
 
 
-def _spline(knots: np.ndarray, at: float) -> np.ndarray:
+def _evaluate_spline(knots: np.ndarray, at: float) -> np.ndarray:
     """Uniform Catmull-Rom spline; time 0 lies at the third knot, so that blur may look a little back."""
     i = int(np.floor(at)) + 2
     f = at - np.floor(at)
@@ -125,7 +125,7 @@ def _spline(knots: np.ndarray, at: float) -> np.ndarray:
     return b + 0.5 * f * (c - a + f * (2 * a - 5 * b + 4 * c - d + f * (3 * (b - c) + d - a)))
 
 
-def _rotation(vector: np.ndarray) -> np.ndarray:
+def _make_rotation(vector: np.ndarray) -> np.ndarray:
     """Rodrigues: the rotation by |vector| radians about it."""
     angle = float(np.linalg.norm(vector)) + 1e-12
     x, y, z = vector / angle

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from lightning_pose.errors import DataError
 from lightning_pose.scenes.formats import load_scene
-from lightning_pose.scenes.formats.icl_nuim import reflect
+from lightning_pose.scenes.formats.icl_nuim import reflect_poses
 from lightning_pose.scenes.scene import Intrinsics
 from tests.data.helpers import make_image
 
@@ -33,7 +33,7 @@ def test_reflection_is_s_t_s() -> None:
     S = np.diag([1.0, -1, 1, 1])
     expected = S @ T @ S
     quats = Rotation.from_matrix(T[:, :3, :3]).as_quat(scalar_first=True)
-    positions, reflected = reflect(T[:, :3, 3], quats)
+    positions, reflected = reflect_poses(T[:, :3, 3], quats)
     np.testing.assert_allclose(positions, expected[:, :3, 3])
     np.testing.assert_allclose(
         Rotation.from_quat(reflected, scalar_first=True).as_matrix(), expected[:, :3, :3], atol=1e-12
