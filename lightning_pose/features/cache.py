@@ -1,4 +1,4 @@
-"""The feature cache: each image is extracted once, on all cores, and read back from disk ever after."""
+"""The feature cache: each image is extracted once, on all cores, and read from disk afterwards."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ __all__ = ["FeatureCache", "FillReport"]
 
 ImagePath = Path | str
 Visit = Callable[[list[int], Record], None]
-"""Takes the numbers of all images that are equal, and their record; called from several threads."""
+"""Called with the numbers of all images that have one content, and their record; from several threads."""
 
 _FORMAT = 1  # raise it when what a record's file holds changes
-_BATCH = 8  # images a call of extract: enough to feed a GPU, few enough to spread over the cores
+_BATCH = 8  # images per call of extract: enough for a GPU, few enough to spread over the cores
 _CHUNK = 64  # records held in memory while iterating
 _STALE_SECONDS = 3600  # the writer of a temporary file this old was killed
 _log = logging.getLogger("lightning_pose")
@@ -60,16 +60,16 @@ class FillReport:
 
 
 class FeatureCache:
-    """An extractor's records on disk, one safetensors file an image, found by what the image holds.
+    """An extractor's records on disk, one safetensors file per image, found by the image's content.
 
     A file is keyed by the bytes of its image and by the extractor's name and settings:
-    `<root>/<name>-<settings>/<ab>/<content>.safetensors`, with the settings spelt out in `settings.json`.
-    So a moved or renamed dataset is still cached, and different settings never meet. A file appears
-    whole or not at all, whenever the process is killed; each carries a checksum, and one that is damaged
-    is extracted again. Several processes may fill one cache at the same time, and share the work.
+    `<root>/<name>-<settings>/<ab>/<content>.safetensors`; `settings.json` has the settings in full. A moved or
+    renamed dataset is therefore still cached, and different settings have different folders. A process that is
+    killed leaves no partial file; each file has a checksum, and a damaged file is written anew. Several processes may
+    fill one cache at the same time and share the work.
 
-    `extractor.extract` is called from several threads at a time, with up to 8 images each. (Processes were a
-    sixth faster with SURF on two cores once they ran, but took seconds to start: as long as 200 images.)
+    `extractor.extract` is called from several threads at a time, with up to 8 images each. (With SURF on two cores,
+    processes were a sixth faster than threads once they ran, but took as long to start as 200 images to extract.)
 
     Args:
         extractor: what computes the records.
@@ -85,7 +85,7 @@ class FeatureCache:
         self.folder = self.root / f"{extractor.name}-{_hash_bytes(canonical.encode(), 8)}"
 
     def fill(self, paths: Sequence[ImagePath], workers: int | None = None, progress: bool = True) -> FillReport:
-        """Extract what the cache lacks; a run that was stopped goes on where it was.
+        """Extract what the cache lacks; a run after an interrupted one continues where that stopped.
 
         Args:
             paths: image files; equal images are extracted once.
@@ -94,13 +94,16 @@ class FeatureCache:
 
         Raises:
             ConfigError: workers is not positive.
-            ImageError: some images cannot be read; all others have been saved by then.
-            CacheError: the cache cannot be written, or not be read.
+            ImageError: some images cannot be read; all others have been saved before.
+            CacheError: the cache cannot be written or read.
         """
         return self._visit(paths, lambda numbers, record: None, workers, progress)
 
     def features(self, paths: Sequence[ImagePath], workers: int | None = None, progress: bool = True) -> np.ndarray:
-        """(len(paths), *extractor.feature_shape) of `extractor.dtype`, what the networks read; `fill` is included."""
+        """The features that networks read, (len(paths), *extractor.feature_shape) of `extractor.dtype`.
+
+        What the cache lacks is extracted first; arguments and errors are those of `fill`.
+        """
         rows = np.empty((len(paths), *self.extractor.feature_shape), self.extractor.dtype)
 
         def put(numbers: list[int], record: Record) -> None:
@@ -112,7 +115,10 @@ class FeatureCache:
     def records(
         self, paths: Sequence[ImagePath], workers: int | None = None, progress: bool = True
     ) -> Iterator[Record]:
-        """The whole record of each image, in order, few in memory at a time; `fill` comes first."""
+        """Yield the record of each image, in order; only 64 are in memory at a time.
+
+        What the cache lacks is extracted first; arguments and errors are those of `fill`.
+        """
         self.fill(paths, workers, progress)
         for start in range(0, len(paths), _CHUNK):
             chunk = paths[start : start + _CHUNK]
@@ -125,10 +131,10 @@ class FeatureCache:
             yield from (found[number] for number in range(len(chunk)))
 
     def _visit(self, paths: Sequence[ImagePath], visit: Visit, workers: int | None, progress: bool) -> FillReport:
-        """Show `visit` the record of every distinct image, read from disk or else extracted and saved."""
+        """Call `visit` with the record of every distinct image, read from disk or else extracted and saved."""
         if workers is not None and workers < 1:
             raise ConfigError(f"workers is {workers}; give the number of threads to extract with, 1 or more")
-        job = _Job(self.extractor, self.folder, paths, visit, workers or _cores())
+        job = _Job(self.extractor, self.folder, paths, visit, workers or _count_cores())
         job.read()
         started = time.perf_counter()
         if job.missing or job.damaged:
@@ -153,7 +159,7 @@ class _Job:
     Attributes:
         numbers: content key to the numbers of all images with that content.
         missing, damaged: keys that must be extracted.
-        bad: image number to why it cannot be read.
+        bad: image number to the error of reading the image.
         computed, redone: extractions done so far, of missing and of damaged ones.
     """
 
@@ -181,7 +187,7 @@ class _Job:
     def extract(self, progress: bool) -> None:
         """Extract, save and visit all that is missing or damaged, in batches spread over the threads."""
         todo = [*self.missing, *self.damaged]
-        random.SystemRandom().shuffle(todo)  # so that processes at the same work meet rarely
+        random.SystemRandom().shuffle(todo)  # so that processes that fill one cache rarely extract the same image
         size = min(_BATCH, -(-len(todo) // self.workers))
         batches = [todo[start : start + size] for start in range(0, len(todo), size)]
         workers = min(self.workers, len(batches))
@@ -195,7 +201,7 @@ class _Job:
                     self.redone += len(done.result() & self.damaged)
                     bar.advance(task, len(futures[done]))
             finally:
-                pool.shutdown(cancel_futures=True)  # after an error or Ctrl-C: only what is under way
+                pool.shutdown(cancel_futures=True)  # after an error or Ctrl-C, finish only the batches under way
 
     def _key(self, number: int) -> str | None:
         try:
@@ -226,7 +232,7 @@ class _Job:
         images: dict[str, np.ndarray] = {}
         for key in batch:
             if key in self.missing and self._held(key):
-                continue  # another process was faster
+                continue  # another process has saved it meanwhile
             number = self.numbers[key][0]
             try:
                 images[key] = self._image(self.paths[number], key)
@@ -246,20 +252,21 @@ class _Job:
 
 
 def _prepare_folder(folder: Path, about: str) -> None:
-    """Make the folder, with its settings.json, and clear what killed writers left there."""
+    """Make the folder and its settings.json, and delete temporary files of processes that were killed."""
     write_whole(folder / "settings.json", about.encode())
     for temporary in folder.glob(f"**/*{TEMPORARY}"):
-        with suppress(OSError):  # another process may clear it first
+        with suppress(OSError):  # another process may delete it first
             if time.time() - temporary.stat().st_mtime > _STALE_SECONDS:
                 temporary.unlink()
 
 
 def _hash_bytes(data: bytes, size: int = 20) -> str:
+    """BLAKE2b digest of `size` bytes, in hexadecimal digits."""
     return hashlib.blake2b(data, digest_size=size).hexdigest()
 
 
-def _cores() -> int:
-    """Cores that this process may use."""
+def _count_cores() -> int:
+    """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -273,7 +280,7 @@ def _join_errors(errors: list[ImageError], total: int) -> str:
 
 @contextmanager
 def _set_inner_threads(count: int) -> Iterator[None]:
-    """Let each of our threads use `count` of its own in torch and OpenCV, so that none fight over a core."""
+    """Set the number of threads that torch and OpenCV start inside each thread of ours, and restore it afterwards."""
     before = torch.get_num_threads(), cv2.getNumThreads()
     torch.set_num_threads(count)
     cv2.setNumThreads(count)
@@ -285,7 +292,7 @@ def _set_inner_threads(count: int) -> Iterator[None]:
 
 
 class _RateColumn(ProgressColumn):
-    """Images a second."""
+    """Shows images per second."""
 
     def render(self, task: Task) -> Text:
         return Text(f"{task.speed:.1f} images/s" if task.speed else "", style="progress.data.speed")

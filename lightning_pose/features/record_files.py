@@ -1,4 +1,4 @@
-"""One record, one file: written whole or not at all, and read back only if it is what was written."""
+"""Files of one record each: never written in part, and read only if the content is what was written."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def read_record(file: Path) -> Record | None:
 
     Raises:
         DamagedError: the file is cut short or altered.
-        CacheError: the file may not be read.
+        CacheError: the file exists and cannot be read.
     """
     try:
         with safe_open(file, framework="numpy") as opened:
@@ -52,13 +52,13 @@ def write_record(file: Path, record: Record) -> None:
     Raises:
         CacheError: as `write_whole`.
     """
-    # safetensors writes the memory of an array as it lies, transposed if the array is.
+    # safetensors writes an array in its memory order, so a transposed array would be saved transposed.
     record = {name: np.asarray(array, order="C") for name, array in record.items()}
     write_whole(file, save(record, {"checksum": _compute_checksum(record)}))
 
 
 def write_whole(file: Path, data: bytes) -> None:
-    """Write a file so that nobody ever sees a part of it; its folder is made.
+    """Write a file under a temporary name and rename it, so that no process reads a part of it; make its folder.
 
     Raises:
         CacheError: the folder cannot be written, or the disk is full.
