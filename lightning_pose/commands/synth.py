@@ -1,4 +1,4 @@
-"""The verb `synth`: renders a synthetic room as a dataset, for trying things out where no data is at hand."""
+"""The command `synth`: renders a synthetic room as a dataset, for users who have no data yet."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ EPILOG = """examples:
 
 
 def main(argv: list[str]) -> int:
-    """Run the verb with the arguments after its name; returns the exit code."""
+    """Run the command with the arguments after its name; return the exit code."""
     args = _build_synth_parser().parse_args(argv)
     columns = (TextColumn("rendering"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, transient=True) as bar:
@@ -49,7 +49,7 @@ def _build_synth_parser() -> VerbParser:
 
 
 def _parse_size(text: str) -> tuple[int, int]:
-    """WxH as two numbers."""
+    """Width and height from a text WxH, in pixels."""
     try:
         width, height = (int(part) for part in text.lower().split("x"))
     except ValueError:

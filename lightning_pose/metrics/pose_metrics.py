@@ -1,4 +1,4 @@
-"""The metrics of a split, gathered batch by batch and over processes."""
+"""Pose errors of a split, collected batch by batch and over processes, and their summary."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ __all__ = ["RECALL_THRESHOLDS", "PoseMetrics", "summarize_errors"]
 
 
 class PoseMetrics(Metric):
-    """Median, mean and 95th percentile errors and recalls over all frames seen (see `summarize_errors`).
+    """Median, mean and 95th percentile errors and recalls over all frames added (see `summarize_errors`).
 
-    Keeps every frame's errors, because medians do not add up; under DDP they are gathered before `compute`.
+    Keeps every frame's errors, because a median cannot be computed from those of batches. With several processes (DDP)
+    the errors of all are gathered before `compute`.
     """
 
     is_differentiable = False
@@ -54,10 +55,10 @@ class PoseMetrics(Metric):
 
 
 def _promote_to_float32(x: Tensor) -> Tensor:
-    """At least single precision: the half precision that autocast leaves rounds metres to centimetres."""
+    """At least single precision: the half precision of autocast would round metres to centimetres."""
     return x.to(torch.promote_types(x.dtype, torch.float32))
 
 
 def _join_state(state: list[Tensor] | Tensor) -> Tensor:
-    """One vector of a state, which is a list before the processes' parts are gathered and a tensor after."""
+    """One vector from a state, which is a list before the processes' parts are gathered and a tensor afterwards."""
     return state if isinstance(state, Tensor) else torch.cat([torch.empty(0), *(s.cpu() for s in state)])

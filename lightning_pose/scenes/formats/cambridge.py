@@ -20,6 +20,7 @@ log = logging.getLogger("lightning_pose")
 SPLIT_FILES = {"train": "dataset_train.txt", "test": "dataset_test.txt"}
 HEADER_LINES = 3
 MAX_DISTANCE_M = 10_000.0
+"""Poses farther than this from the median position are dropped."""
 
 
 class Cambridge(SceneFormat):
@@ -27,7 +28,7 @@ class Cambridge(SceneFormat):
 
     xyz is the camera centre in the world, metres; the quaternion is world-to-camera, w first, and is
     inverted here. The image's folder is its sequence. Poses more than 10 km from the median of all
-    positions are failures of the reconstruction: they are dropped with a warning.
+    positions are errors of the reconstruction; they are dropped with a warning.
     """
 
     name = "cambridge"
@@ -52,10 +53,11 @@ class Cambridge(SceneFormat):
 FORMAT = Cambridge()
 
 Row = tuple[str, list[float], str]
-"""Image, its seven numbers, and the place in the file."""
+"""An image, its seven numbers, and its place in the file."""
 
 
 def _read_pose_list(path: Path) -> list[Row]:
+    """Read the rows of a split's file."""
     rows = []
     for number, line in read_lines(path):
         if number <= HEADER_LINES:
@@ -75,7 +77,7 @@ def _read_pose_list(path: Path) -> list[Row]:
 
 
 def _make_frames(root: Path, rows: dict[str, list[Row]]) -> tuple[tuple[Frame, ...], dict[Path, str]]:
-    """The frames of both lists, ordered, and the split of each image."""
+    """Make the frames of both lists, sorted, and find the split of each image."""
     split_of: dict[Path, str] = {}
     for split, listed in rows.items():
         for image, _, place in listed:
@@ -93,7 +95,7 @@ def _make_frames(root: Path, rows: dict[str, list[Row]]) -> tuple[tuple[Frame, .
 
 
 def _keep_near_median(root: Path, positions_m: np.ndarray) -> np.ndarray:
-    """Rows within MAX_DISTANCE_M of the median position."""
+    """Rows within MAX_DISTANCE_M of the median position; warn if others are dropped."""
     if not len(positions_m):
         return np.array([], dtype=int)
     distance = np.linalg.norm(positions_m - np.median(positions_m, axis=0), axis=1)
@@ -105,7 +107,7 @@ def _keep_near_median(root: Path, positions_m: np.ndarray) -> np.ndarray:
 
 
 def _parse_image_path(root: Path, image: str) -> tuple[str, int]:
-    """`seq1/frame00012.png` -> `seq1`, 12."""
+    """Sequence and frame number of an image path: `seq1`, 12 of `seq1/frame00012.png`."""
     path = PurePosixPath(image)
     number = re.search(r"\d+", path.stem)
     folder = path.parent.as_posix()

@@ -31,13 +31,13 @@ class IclNuim(SceneFormat):
     """A trajectory whose first column is the frame's number N, and the images `rgb/N.png`.
 
     The trajectory is `*.gt.freiburg` (`livingRoom2.gt.freiburg`, `traj0.gt.freiburg`), or a
-    `groundtruth.txt` that counts 0, 1, 2, ... or 1, 2, 3, ...; its other columns are TUM's. The images are
+    `groundtruth.txt` that counts 0, 1, 2, ... or 1, 2, 3, ...; its other columns are those of TUM. The images are
     those of `associations.txt` or `rgb.txt` (the last column is the path), or of the folder `rgb`; an image
     without a pose, as each release has one, is dropped with a warning. Timestamps are N / 30 s.
 
-    The world of the poses has y up while the images are stored top-down: the poses are reflected. That is
-    what the published fy = -480 stands for, so the camera has fy = +480 here. A numbered trajectory that
-    already has OpenCV axes is no ICL-NUIM: read it with format `tum`.
+    In the world of the poses y points up, while the images are stored from top to bottom, so the poses are reflected.
+    The published fy = -480 means the same; here fy is +480. A numbered trajectory that already has OpenCV axes is no
+    ICL-NUIM: read it with format `tum`.
     """
 
     name = "icl_nuim"
@@ -78,7 +78,7 @@ FORMAT = IclNuim()
 
 
 def reflect_poses(positions_m: np.ndarray, quats_wxyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """S T S with S = diag(1, -1, 1, 1): the same poses with the y axes of world and camera turned over.
+    """Reverse the y axes of world and camera: S T S with S = diag(1, -1, 1, 1).
 
     The position (x, y, z) becomes (x, -y, z). A rotation's axis is an axial vector, so a mirror flips the
     components within its plane: (w, x, y, z) becomes (w, -x, y, -z).
@@ -86,12 +86,15 @@ def reflect_poses(positions_m: np.ndarray, quats_wxyz: np.ndarray) -> tuple[np.n
     Args:
         positions_m: (N, 3).
         quats_wxyz: (N, 4).
+
+    Returns:
+        positions (N, 3) and quaternions (N, 4).
     """
     return positions_m * [1, -1, 1], quats_wxyz * [1, -1, 1, -1]
 
 
 def _find_trajectory(root: Path) -> Path | None:
-    """The file with the poses; the first by name if there are several, as they would be one to a folder."""
+    """The file with the poses, None if there is none; the first by name if there are several."""
     published = sorted(root.glob("*.gt.freiburg"))
     ours = root / "groundtruth.txt"
     if published:
@@ -100,7 +103,7 @@ def _find_trajectory(root: Path) -> Path | None:
 
 
 def _find_images(root: Path) -> dict[int, Path]:
-    """Number -> image."""
+    """Image files by the numbers of their frames."""
     lists = [root / name for name in ("associations.txt", "rgb.txt") if (root / name).is_file()]
     if lists:
         paths = [root / line.split()[-1] for _, line in read_lines(lists[0])]

@@ -1,4 +1,4 @@
-"""Microsoft 7-Scenes (Shotton et al., CVPR 2013), and the synthetic room that is written in its layout."""
+"""Microsoft 7-Scenes (Shotton et al., CVPR 2013), and the synthetic room, which is written in the same layout."""
 
 from __future__ import annotations
 
@@ -16,15 +16,16 @@ __all__ = ["FORMAT", "SevenScenes"]
 
 SPLIT_FILES = {"train": "TrainSplit.txt", "test": "TestSplit.txt"}
 COLOUR = Intrinsics(fx=525.0, fy=525.0, cx=320.0, cy=240.0)
+"""Nominal values of the Kinect's colour camera, in pixels."""
 FRAME_FILE = re.compile(r"frame-(\d+)\.(?:(color\.(?:png|jpe?g))|(pose\.txt))")
 
 
 class SevenScenes(SceneFormat):
-    """`TrainSplit.txt` and `TestSplit.txt` list `sequenceN`, which is the folder `seq-NN`.
+    """`TrainSplit.txt` and `TestSplit.txt` list sequences as `sequenceN`, the folder `seq-NN`.
 
     Each sequence holds `frame-NNNNNN.color.png` (or jpg) and `frame-NNNNNN.pose.txt`, the 4x4
-    camera-to-world matrix in metres, OpenCV axes. A file `synthetic.json` marks a rendered room and gives
-    its camera as `intrinsics`: `fx`, `fy`, `cx`, `cy`; the camera of the real scenes is Kinect's nominal one.
+    camera-to-world matrix in metres, OpenCV axes. A rendered room has a file `synthetic.json` with
+    its camera as `intrinsics`: `fx`, `fy`, `cx`, `cy`; real scenes get the Kinect's nominal values.
     """
 
     name = "7scenes"
@@ -49,7 +50,7 @@ FORMAT = SevenScenes()
 
 
 def _read_split_files(root: Path) -> dict[str, str]:
-    """Folder name of each listed sequence -> its split."""
+    """The split of each listed sequence, by the name of its folder."""
     split_of: dict[str, str] = {}
     for split, file in SPLIT_FILES.items():
         lines = read_lines(root / file)
@@ -73,7 +74,7 @@ def _read_split_files(root: Path) -> dict[str, str]:
 
 
 def _read_sequence(folder: Path, intrinsics: Intrinsics) -> list[Frame]:
-    """The frames of one sequence, in no particular order."""
+    """Read the frames of one sequence, in no particular order."""
     images: dict[int, Path] = {}
     poses: dict[int, Path] = {}
     for path in folder.iterdir():
@@ -94,15 +95,16 @@ def _read_sequence(folder: Path, intrinsics: Intrinsics) -> list[Frame]:
 
 
 def _read_matrix(path: Path) -> np.ndarray:
-    """(4, 4) float64."""
+    """Read a pose file, (4, 4) float64."""
     try:
-        # Thousands of these are read: np.loadtxt is forty times slower.
+        # np.loadtxt is forty times slower, and a scene has thousands of these files.
         return np.array(path.read_text().split(), dtype=np.float64).reshape(4, 4)
     except ValueError as error:
         raise DataError(f"{path}: not a 4x4 matrix of numbers ({error}); restore the original") from error
 
 
 def _read_intrinsics(root: Path) -> Intrinsics:
+    """Read the camera of a rendered room; of any other folder it is that of 7-Scenes."""
     path = root / "synthetic.json"
     if not path.is_file():
         return COLOUR

@@ -1,4 +1,4 @@
-"""TUM RGB-D (Sturm et al., IROS 2012): an image list and a trajectory, each with its own clock readings."""
+"""TUM RGB-D (Sturm et al., IROS 2012): an image list and a trajectory, each with its own timestamps."""
 
 from __future__ import annotations
 
@@ -17,12 +17,14 @@ log = logging.getLogger("lightning_pose")
 
 TRAJECTORY_COLUMNS = "timestamp tx ty tz qx qy qz qw"
 MAX_DIFFERENCE_S = 0.02
+"""Largest difference in time between an image and its pose."""
+
 CAMERAS = {
     "freiburg1": Intrinsics(fx=517.3, fy=516.5, cx=318.6, cy=255.3),
     "freiburg2": Intrinsics(fx=520.9, fy=521.0, cx=325.1, cy=249.7),
     "freiburg3": Intrinsics(fx=535.4, fy=539.2, cx=320.1, cy=247.6),
 }
-"""The calibrated colour cameras of the benchmark, known by the folder's name."""
+"""The calibrated colour cameras of the benchmark, by a part of the folder's name."""
 
 
 class Tum(SceneFormat):
@@ -73,7 +75,7 @@ def pair_by_time(times: np.ndarray, pose_times: np.ndarray) -> np.ndarray:
         pose_times: (M,) seconds, in any order.
 
     Returns:
-        (K, 2) rows of the image and of the pose, in the images' order, at most 20 ms apart.
+        (K, 2) pairs of an image's row and a pose's row, in the order of the images, at most 20 ms apart.
     """
     order = np.argsort(pose_times, kind="stable")
     first = np.searchsorted(pose_times[order], times - MAX_DIFFERENCE_S, side="left")
@@ -90,7 +92,7 @@ def pair_by_time(times: np.ndarray, pose_times: np.ndarray) -> np.ndarray:
 
 
 def is_numbered(trajectory: Path) -> bool:
-    """Whether the first column counts frames (0, 1, 2, ... or 1, 2, 3, ...) in place of telling the time."""
+    """Whether the first column counts frames (0, 1, 2, ... or 1, 2, 3, ...) and has no times."""
     numbers = [line.split()[0] for _, line in read_lines(trajectory)]
     return numbers[:1] in (["0"], ["1"]) and all(
         number == str(int(numbers[0]) + row) for row, number in enumerate(numbers)
@@ -98,7 +100,7 @@ def is_numbered(trajectory: Path) -> bool:
 
 
 def _read_image_list(path: Path) -> tuple[np.ndarray, list[str]]:
-    """Times in seconds, ascending, and the image paths as listed."""
+    """Read the image list: times in seconds, ascending, and the paths as listed, in the same order."""
     entries = []
     for number, line in read_lines(path):
         try:
@@ -113,4 +115,5 @@ def _read_image_list(path: Path) -> tuple[np.ndarray, list[str]]:
 
 
 def _format_span(times: np.ndarray) -> str:
+    """First and last time, in words."""
     return f"{times.min():.3f} to {times.max():.3f} s" if len(times) else "nothing"
