@@ -1,4 +1,4 @@
-"""SURF's orientation and descriptor: Haar wavelet responses around each keypoint, out of integral images.
+"""SURF's orientation and descriptor: Haar wavelet responses around each keypoint, from integral images.
 
 Bay, Ess, Tuytelaars, Van Gool: "Speeded-Up Robust Features", 2008, section 4. Windows, weights, angles and
 the order of the 64 numbers are OpenCV's: 4 x 4 fields, across the keypoint's angle and then along it, each with
@@ -17,16 +17,16 @@ from torch.nn.functional import normalize, pad
 __all__ = ["UPRIGHT_ANGLE", "compute_descriptors", "compute_orientations"]
 
 UPRIGHT_ANGLE = 270.0
-"""Degrees; the angle of keypoints whose orientation is not looked for."""
+"""Angle in degrees of keypoints whose orientation is not computed."""
 
 CELLS = 21
-"""Cells on a side of the window; each of the 20 x 20 samples is a Haar response of 2 x 2 of them."""
+"""Cells along a side of the window; each of the 20 x 20 samples is the Haar response of 2 x 2 cells."""
 
 
 def compute_descriptors(
     integral: Tensor, image: Tensor, xy: Tensor, size: Tensor, angle: Tensor | None = None
 ) -> Tensor:
-    """(K, 64) L2-normalised descriptors.
+    """Compute descriptors (K, 64), L2-normalised.
 
     Args:
         integral: (B, H + 1, W + 1) int32 integral images.
@@ -35,7 +35,7 @@ def compute_descriptors(
         size: (K,) float32, whole pixels; a keypoint of size 0 gets a zero row.
         angle: (K,) float32, degrees; None for upright windows.
     """
-    window = torch.div(size * 14, 5, rounding_mode="floor")  # 21 * 1.2 / 9 of the size, free of rounding errors
+    window = torch.div(size * 14, 5, rounding_mode="floor")  # 21 * 1.2 / 9 of the size, without rounding errors
     if angle is None:
         patch = _sample_upright_patch(integral, image, xy, window)
     else:
@@ -49,9 +49,9 @@ def compute_descriptors(
 
 
 def compute_orientations(integral: Tensor, image: Tensor, xy: Tensor, size: Tensor) -> Tensor:
-    """(K,) dominant gradient directions, degrees in 0..360: the strongest 60-degree sector of a disc.
+    """Compute dominant gradient directions (K,), degrees in 0..360: the strongest 60-degree sector of a disc.
 
-    Args: as for `compute_descriptors`. Samples whose wavelet leaves the image are left out.
+    Arguments are as for `compute_descriptors`. Samples whose wavelet leaves the image are left out.
     """
     disc, weight = _make_disc(integral.device)
     scale = size * (1.2 / 9)
@@ -75,11 +75,12 @@ def compute_orientations(integral: Tensor, image: Tensor, xy: Tensor, size: Tens
 
 
 def _compute_second_difference(a: Tensor) -> Tensor:
+    """Second difference of three neighbours along the first axis."""
     return a[0] - 2 * a[1] + a[2]
 
 
 def _sample_upright_patch(integral: Tensor, image: Tensor, xy: Tensor, window: Tensor) -> Tensor:
-    """(21, 21, K) grey sums of cells, to the right and upwards, as OpenCV places whole pixels."""
+    """Grey sums of cells (21, 21, K), to the right and upwards, with cells on whole pixels as OpenCV has them."""
     x, y = xy.unbind(1)
     half = (window - 1) / 2
     edge = torch.arange(CELLS + 1, device=xy.device)[:, None] * (window / CELLS)
@@ -89,9 +90,9 @@ def _sample_upright_patch(integral: Tensor, image: Tensor, xy: Tensor, window: T
 
 
 def _sample_rotated_patch(integral: Tensor, image: Tensor, xy: Tensor, window: Tensor, angle: Tensor) -> Tensor:
-    """(21, 21, K) grey sums around the centres of rotated cells, across and along the angle.
+    """Grey sums (21, 21, K) around the centres of rotated cells, across and along the angle.
 
-    The cells themselves stay parallel to the image, so that integral images serve.
+    The cells themselves are parallel to the image's axes, as integral images need them.
     """
     cell = window / CELLS
     along = (torch.arange(CELLS, device=xy.device) - CELLS // 2)[:, None] * cell
@@ -104,10 +105,10 @@ def _sample_rotated_patch(integral: Tensor, image: Tensor, xy: Tensor, window: T
 
 
 def _sample_integral(integral: Tensor, image: Tensor, y: Tensor, x: Tensor) -> Tensor:
-    """(R, C, K) integrals at R fractional rows and C columns of each of K places, up to terms of one axis.
+    """Integrals (R, C, K) at R fractional rows and C columns of each of K places, up to terms of one axis.
 
-    What depends on the row alone or on the column alone drops out of every box sum; without it the
-    numbers are small enough for float32. Outside the image the border pixels are repeated.
+    Terms that depend on the row alone or the column alone cancel in every box sum; without them the numbers are small
+    enough for float32. Outside the image the border pixels are repeated.
     """
     plane, line, _ = integral.stride()
     rows, down = _find_lattice_cells(y, integral.shape[1])
@@ -120,9 +121,9 @@ def _sample_integral(integral: Tensor, image: Tensor, y: Tensor, x: Tensor) -> T
 
 
 def _find_lattice_cells(position: Tensor, length: int) -> tuple[Tensor, Tensor]:
-    """Lattice neighbours (2 * E, K) int32 below and above each position; fraction (E, K) between them.
+    """Whole numbers (2 * E, K) int32 below and above each position, and the fraction (E, K) between them.
 
-    Beyond the ends the neighbours stay and the fraction leaves 0..1: linear extrapolation.
+    Beyond the ends the two last numbers are used with a fraction outside 0..1: linear extrapolation.
     """
     below = position.floor().clamp_(0, length - 2)
     cell = below.int()
@@ -131,7 +132,7 @@ def _find_lattice_cells(position: Tensor, length: int) -> tuple[Tensor, Tensor]:
 
 @lru_cache(maxsize=4)
 def _make_filters(device: torch.device) -> Tensor:
-    """(40, 21) Gaussian-weighted: 20 sums of two neighbouring cells, then the 20 changes between them."""
+    """Filters (40, 21): Gaussian-weighted, 20 sums of two neighbouring cells, then 20 differences between them."""
     cells = torch.eye(CELLS)
     i = torch.arange(CELLS - 1) - (CELLS - 2) / 2
     weight = torch.exp(-(i**2) / (2 * 3.3**2))[:, None]
@@ -140,7 +141,7 @@ def _make_filters(device: torch.device) -> Tensor:
 
 @lru_cache(maxsize=4)
 def _make_disc(device: torch.device) -> tuple[Tensor, Tensor]:
-    """(2, 113) lattice points x, y within a radius of 6, and their (113,) Gaussian weights."""
+    """Points (2, 113) with whole x, y within a radius of 6, and their Gaussian weights (113,)."""
     points = torch.cartesian_prod(*[torch.arange(-6, 7)] * 2).T
     square = points.square().sum(0)
     points, square = points[:, square <= 36], square[square <= 36]

@@ -1,4 +1,4 @@
-"""SURF's detector: the strongest maxima of the Hessian's determinant over place and scale.
+"""SURF's detector: the strongest maxima of the Hessian's determinant over position and scale.
 
 Bay, Ess, Tuytelaars, Van Gool: "Speeded-Up Robust Features", 2008, section 3.3, with OpenCV's borders and
 rounding. A pixel's centre has integer coordinates.
@@ -45,12 +45,12 @@ class Detections(NamedTuple):
 
 
 class _Planes(NamedTuple):
-    """The searched layers 1, 2, 3 of all octaves, end to end; an octave is (B, height, width).
+    """Determinants of layers 1, 2, 3 of all octaves, one octave after the other; an octave is (B, height, width).
 
     Attributes:
         det: (3, S) float32 determinants.
         bits: (S,) float32, bit k set at a candidate of layer k + 1.
-        grids: (3, OCTAVES) int64: height, width, and where the octave starts.
+        grids: (3, OCTAVES) int64: height, width, and start of each octave in S.
     """
 
     det: Tensor
@@ -59,7 +59,7 @@ class _Planes(NamedTuple):
 
 
 class _Candidates(NamedTuple):
-    """Samples that no neighbour in the searched layers exceeds: index into the planes, and where that is."""
+    """Samples that no neighbour in layers 1 to 3 exceeds: index into `_Planes`, octave, layer, image, row, column."""
 
     at: Tensor
     octave: Tensor
@@ -73,12 +73,12 @@ class _Candidates(NamedTuple):
 
 
 def detect_keypoints(integral: Tensor, n: int, threshold: float) -> Detections:
-    """The n strongest features of each image whose determinant is above the threshold.
+    """Find the n strongest features of each image whose determinant is above the threshold.
 
     Args:
         integral: (B, H + 1, W + 1) int32 integral images.
         n: rows to return per image.
-        threshold: determinants up to this one do not count; OpenCV's hessianThreshold.
+        threshold: determinants must be larger than this; OpenCV's hessianThreshold.
     """
     planes = _compute_planes(integral, threshold)
     candidates, score = _list_candidates(planes, len(integral))
@@ -87,7 +87,8 @@ def detect_keypoints(integral: Tensor, n: int, threshold: float) -> Detections:
     scores[candidates.image, torch.arange(total, device=score.device)] = score
     scores, ranking = scores.sort(dim=1, descending=True, stable=True)
 
-    # Refining costs more than ranking, and about two thirds survive it: from the top down, until n have.
+    # Refining takes longer than sorting, and keeps about two thirds: candidates are refined from the strongest down,
+    # until each image has n.
     found = []
     enough = max(2 * n, 600)
     for first in range(0, total, enough):
@@ -104,6 +105,7 @@ def detect_keypoints(integral: Tensor, n: int, threshold: float) -> Detections:
 
 
 def _compute_planes(integral: Tensor, threshold: float) -> _Planes:
+    """Compute the determinants of layers 1 to 3 of all octaves, and mark candidates."""
     batch, height, width = integral.shape
     shapes = [[max((side - 1 >> octave) - 2 * LOW, 0) for side in (height, width)] for octave in range(OCTAVES)]
     ends = np.cumsum([batch * h * w for h, w in shapes]).tolist()
@@ -125,16 +127,16 @@ def _compute_planes(integral: Tensor, threshold: float) -> _Planes:
 
 
 def _mark_maxima(det: list[Tensor], threshold: float, scratch: Tensor, bits: Tensor) -> None:
-    """Set bit k where layer k + 1 is above the threshold and no neighbour in these layers exceeds it.
+    """Set bit k of samples where layer k + 1 is above the threshold and no neighbour in these layers exceeds it.
 
-    Comparing in place, in float32, is several times faster than making masks.
+    Comparisons in place, in float32, are several times faster than masks.
     """
     batch, h, w = bits.shape
     highest = view_head(scratch[0], batch, h, w)
     least = float(np.nextafter(np.float32(threshold), np.float32(np.inf)))
 
     def mark(k: int) -> None:
-        inset = compute_margin(k + 2) + 1 - LOW  # a sample more than the filters of the layer above need
+        inset = compute_margin(k + 2) + 1 - LOW  # one sample more than the filters of the layer above need
         n, m = h - 2 * inset, w - 2 * inset
         if min(n, m) < 1:
             return
@@ -156,7 +158,7 @@ def _mark_maxima(det: list[Tensor], threshold: float, scratch: Tensor, bits: Ten
 
 
 def _list_candidates(planes: _Planes, batch: int) -> tuple[_Candidates, Tensor]:
-    """The marked samples, and their determinants."""
+    """List the marked samples, and their determinants."""
     marked = _find_nonzero(planes.bits)
     layer, entry = (planes.bits[marked].int() & marked.new_tensor([[1], [2], [4]])).nonzero().unbind(1)
     at = marked[entry]
@@ -170,7 +172,7 @@ def _list_candidates(planes: _Planes, batch: int) -> tuple[_Candidates, Tensor]:
 
 
 def _find_nonzero(values: Tensor) -> Tensor:
-    """Where the (S,) values are not zero. Eight bytes at a time, as these are few."""
+    """Indices of values (S,) that are not zero; eight are tested at a time, because few are not zero."""
     flags = pad(values.bool(), (0, -len(values) % 8))
     words = flags.view(torch.int64).nonzero().squeeze(1)
     word, byte = flags.view(-1, 8)[words].nonzero().unbind(1)
@@ -178,11 +180,11 @@ def _find_nonzero(values: Tensor) -> Tensor:
 
 
 def _refine_candidates(integral: Tensor, planes: _Planes, found: _Candidates) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Check K candidates against all 26 neighbours, and move them to the top of the quadric they form.
+    """Compare K candidates with all 26 neighbours, and move them to the maximum of the quadric through these.
 
     Returns:
-        keep (K,) bool: strict maxima whose quadric has its top within a sample; x, y (sub-pixel) and size
-        (sub-scale, rounded to pixels).
+        keep (K,) bool: strict maxima whose quadric has its maximum within one sample; x, y (sub-pixel) and size
+        (interpolated between scales, rounded to pixels).
     """
     near = torch.arange(-1, 2, device=integral.device)
     width = planes.grids[1, found.octave]
@@ -192,7 +194,7 @@ def _refine_candidates(integral: Tensor, planes: _Planes, found: _Candidates) ->
     lowest, highest = found.layer == 1, found.layer == 3
     outer = compute_determinants_at(
         integral, found.octave, 4 * highest.long(), found.image, found.row, found.col
-    )  # layer 0 or 4; not searched, so known nowhere else
+    )  # layer 0 or 4, which `_Planes` does not hold
     det[0] = torch.where(lowest, outer, det[0])
     det[2] = torch.where(highest, outer, det[2])
 
@@ -208,7 +210,11 @@ def _refine_candidates(integral: Tensor, planes: _Planes, found: _Candidates) ->
 
 
 def _find_top(d: Tensor) -> tuple[Tensor, Tensor]:
-    """Top of the quadric through (3, 3, 3, K) samples: (3, K) offsets in x, y, scale; (K,) within a sample?"""
+    """Fit a quadric to samples (3, 3, 3, K): layer, row, column.
+
+    Returns:
+        offsets (3, K) of its maximum in x, y and scale; (K,) bool, whether all three are within one sample.
+    """
     plus, minus = (torch.stack([d[1, 1, e], d[1, e, 1], d[e, 1, 1]]) for e in (2, 0))
     gradient = (plus - minus) / 2
     dxx, dyy, dss = plus - 2 * d[1, 1, 1] + minus

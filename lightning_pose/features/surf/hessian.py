@@ -1,7 +1,7 @@
-"""SURF's filters: integral images, and the determinant of the Hessian from box sums, on grids and at points.
+"""SURF's filters: integral images, and the determinant of the Hessian from box sums, on grids and at single samples.
 
 Bay, Ess, Tuytelaars, Van Gool: "Speeded-Up Robust Features", 2008, section 3.2. Filter sizes and sampling
-are laid out as OpenCV does it: 4 octaves of 5 layers, octave o sampled every 2**o pixels. Sample (row,
+are those of OpenCV: 4 octaves of 5 layers, octave o sampled every 2**o pixels. Sample (row,
 column) of an octave is the centre of its filters, whatever their size.
 """
 
@@ -33,9 +33,10 @@ Number = TypeVar("Number", int, Tensor)
 
 
 def compute_integral_image(gray: Tensor) -> Tensor:
-    """(B, H, W) uint8 -> (B, H + 1, W + 1) int32: [:, y, x] is the sum over rows < y and columns < x.
+    """Compute integral images (B, H + 1, W + 1) int32 of images (B, H, W) uint8.
 
-    On huge images the sums wrap around, and every box sum below 2**31 is still exact.
+    Entry [:, y, x] is the sum over rows < y and columns < x. On very large images the sums overflow, but box sums below
+    2**31 are still exact.
     """
     rows = torch.cumsum(gray, 2, dtype=torch.int32)
     integral = gray.new_zeros((gray.shape[0], gray.shape[1] + 1, gray.shape[2] + 1), dtype=torch.int32)
@@ -44,25 +45,25 @@ def compute_integral_image(gray: Tensor) -> Tensor:
 
 
 def compute_filter_size(octave: Number, layer: Number) -> Number:
-    """Side of a layer's filter, pixels."""
+    """Side of a layer's filter in pixels."""
     return (9 + 6 * layer) << octave
 
 
 def compute_margin(layer: Number) -> Number:
-    """Samples of an octave before the first whose filter lies inside the image."""
+    """Number of samples of an octave before the first one whose filter lies inside the image."""
     return 4 + 3 * layer
 
 
 def view_head(memory: Tensor, *shape: int) -> Tensor:
-    """The head of a flat tensor, in another shape."""
+    """View the first elements of a flat tensor in another shape."""
     return memory.narrow(0, 0, math.prod(shape)).view(shape)
 
 
 def compute_determinants(integral: Tensor, octave: int, layer: int, first: int, scratch: Tensor, out: Tensor) -> None:
-    """Write a layer's determinants at the (n, m) samples from (first, first) on.
+    """Write a layer's determinants at the (n, m) samples from (first, first) on into `out`.
 
-    Every sum of boxes is built from shifted differences of whole planes, each shared by many boxes, in
-    memory that is used over and over: page faults would cost as much as the sums.
+    Box sums are differences of shifted planes, which many boxes share. They are computed in memory that is reused,
+    because page faults of new memory would take as long as the sums.
 
     Args:
         integral: (B, H + 1, W + 1) int32.
@@ -107,7 +108,12 @@ def compute_determinants(integral: Tensor, octave: int, layer: int, first: int, 
 def compute_determinants_at(
     integral: Tensor, octave: Tensor, layer: Tensor, image: Tensor, row: Tensor, col: Tensor
 ) -> Tensor:
-    """(3, 3, K) determinants (row, column) at and around each of K samples; all arguments are (K,) int64."""
+    """Compute determinants (3, 3, K), by row and column, at and around each of K samples.
+
+    Args:
+        integral: (B, H + 1, W + 1) int32.
+        octave: (K,) int64, as are the others: layer, image, and row and column in the octave's samples.
+    """
     plane, line, _ = integral.stride()
     corners, areas = _make_boxes(integral.device)
     layer_id = octave * LAYERS + layer
@@ -125,17 +131,17 @@ def compute_determinants_at(
 
 
 def _find_lobe_edges(size: int) -> tuple[int, int, int, int, int]:
-    """The paper's 9 x 9 filters, scaled.
+    """Positions of the lobes in a filter of this size, scaled from the paper's 9 x 9 filters.
 
     Returns:
-        width of a lobe; near and far edge of a lobe's long side; near edges of the diagonal lobes.
+        width of a lobe; first and last edge of a lobe's long side; first edges of the two diagonal lobes.
     """
     near, far, first, second = (round(size * ninths / 9) for ninths in (2, 7, 1, 5))
     return size // 3, near, far, first, second
 
 
 def _sum_lobes(edges: list[Tensor], scratch: Tensor, out: Tensor) -> None:
-    """Write the sum over three adjoining lobes, weighted 1, -2, 1, from the integrals at their four edges."""
+    """Write the sum over three adjoining lobes, with weights 1, -2, 1, from the integrals at their four edges."""
     a, b, c, d = edges
     middle = torch.sub(c, b, out=view_head(scratch, *out.shape))
     out.copy_(torch.add(d, middle, alpha=-3, out=middle).sub_(a))
@@ -143,7 +149,7 @@ def _sum_lobes(edges: list[Tensor], scratch: Tensor, out: Tensor) -> None:
 
 @lru_cache(maxsize=4)
 def _make_boxes(device: torch.device) -> tuple[Tensor, Tensor]:
-    """The filters of all layers (octave * LAYERS + layer) as eight boxes: two of dxx, two of dyy, four of dxy.
+    """The filters of all layers (octave * LAYERS + layer) as eight boxes each: two of dxx, two of dyy, four of dxy.
 
     Returns:
         (2, 32, 20) int32: y and x of the boxes' corners, corner by corner; (2, 20) float32: the areas that

@@ -1,4 +1,7 @@
-"""What hangs on the walls of the synthetic room: signs, paintings, maps, windows, clocks; no two alike."""
+"""Images of the pictures on the walls of the synthetic room: signs, paintings, maps, windows and clocks.
+
+Every function takes a random generator and a size in pixels and returns an (H, W, 3) uint8 BGR image.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,7 @@ __all__ = ["paint_poster"]
 
 
 def paint_poster(rng: np.random.Generator, h: int, w: int) -> np.ndarray:
-    """(H, W, 3) uint8 BGR: a random kind of picture in a frame."""
+    """A random kind of picture in a frame."""
     kinds = (_paint_sign, _paint_sign, _paint_shapes, _paint_map, _paint_landscape, _paint_window, _paint_clock)
     image = kinds[rng.integers(len(kinds))](rng, h, w)
     cv2.rectangle(image, (0, 0), (w - 1, h - 1), pick_color(rng, (0.1, 0.9)), int(rng.integers(4, 14)))
@@ -19,6 +22,7 @@ def paint_poster(rng: np.random.Generator, h: int, w: int) -> np.ndarray:
 
 
 def _paint_paper(rng: np.random.Generator, h: int, w: int) -> np.ndarray:
+    """A pale background with slight noise."""
     image = np.full((h, w, 3), pick_color(rng, (0.75, 1.0), (0.0, 0.5)), np.uint8)
     return shade_image(image, 1 + 0.03 * make_noise(rng, h, w))
 
@@ -73,7 +77,7 @@ def _paint_map(rng: np.random.Generator, h: int, w: int) -> np.ndarray:
 
 
 def _paint_landscape(rng: np.random.Generator, h: int, w: int) -> np.ndarray:
-    """Bands of a fractal field, like a geological landscape, with brush dabs."""
+    """Coloured bands of fractal noise, as of a landscape, with short brush strokes."""
     inks = np.array([pick_color(rng, (0.2, 1.0), (0.2, 0.9)) for _ in range(9)], np.uint8)
     field = make_noise(rng, h, w, (70, 70, 30, 14)) + np.linspace(-2, 2, h, dtype=np.float32)[:, None]
     image = inks[np.clip(((field + 3) * 1.5).astype(int), 0, 8)]
@@ -84,7 +88,7 @@ def _paint_landscape(rng: np.random.Generator, h: int, w: int) -> np.ndarray:
 
 
 def _paint_window(rng: np.random.Generator, h: int, w: int) -> np.ndarray:
-    """Sky over a lit skyline, behind bars."""
+    """Sky over houses with lit windows, behind two bars."""
     sky = np.linspace(0, 1, h, dtype=np.float32)[:, None, None]
     zenith, horizon = np.array(pick_color(rng, (0.6, 0.9), (0.3, 0.6))), np.array(pick_color(rng, (0.8, 1.0)))
     image = shade_image((1 - sky) * zenith + sky * horizon, 1 + 0.08 * make_noise(rng, h, w, (90, 45, 20)))
@@ -102,7 +106,7 @@ def _paint_window(rng: np.random.Generator, h: int, w: int) -> np.ndarray:
 
 
 def _paint_clock(rng: np.random.Generator, h: int, w: int) -> np.ndarray:
-    """A dial with twelve figures, two hands and a maker's name, on striped card."""
+    """A dial with twelve figures, two hands and a word, on a striped background."""
     image = _paint_paper(rng, h, w)
     for x in range(0, w, 24):
         stripe = pick_color(rng, (0.6, 0.9), (0.1, 0.4))

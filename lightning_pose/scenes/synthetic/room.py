@@ -1,7 +1,7 @@
-"""The synthetic room: which textured rectangles it is made of, and the light baked into them.
+"""The synthetic room: the textured rectangles of its walls, furniture and pictures, with light in their textures.
 
-The world's origin is the middle of the floor; x runs along the longer walls, y towards the wall that the
-camera mostly looks at, z up; metres.
+The world's origin is the middle of the floor; x points along the longer walls, y to the wall that the camera mostly
+looks at, z up; metres.
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ from lightning_pose.scenes.synthetic.posters import paint_poster
 __all__ = ["TEXELS_PER_M", "Quad", "Room", "make_room"]
 
 TEXELS_PER_M = 256
+"""Pixels of a texture per metre."""
+
 Paint = Callable[[np.random.Generator, int, int], np.ndarray]
 RIGHT = {
     "-y": (1, 0, 0),
@@ -29,12 +31,12 @@ RIGHT = {
     "-z": (1, 0, 0),
 }
 DOWN = {"+z": (0, -1, 0), "-z": (0, 1, 0)}
-"""A surface's texture axes by the axis that it faces; whatever faces sideways hangs upright."""
+"""World axes of a texture's rows and columns by the direction that a surface faces; columns of walls point down."""
 
 
 @dataclass(frozen=True)
 class Quad:
-    """A textured rectangle, seen from one side: there u points right and v down.
+    """A textured rectangle, visible from one side, from which u points right and v down.
 
     Attributes:
         corner: (3,) world position of the texture's top left corner.
@@ -51,14 +53,14 @@ class Quad:
 
 @dataclass(frozen=True)
 class Room:
-    """Everything that can be seen, and (3,) the room's extent along x, y and z."""
+    """All rectangles of a room, and its extent (3,) along x, y and z in metres."""
 
     quads: tuple[Quad, ...]
     size_m: np.ndarray
 
 
 def make_room(seed: int) -> Room:
-    """Furnish the room of one seed: dimensions, surfaces, furniture, pictures and lamps are all its own."""
+    """Make the room of a seed, which chooses dimensions, surfaces, furniture, pictures and lamps."""
     rng = np.random.default_rng([seed, 0])
     size = rng.uniform((5.4, 3.8, 2.5), (6.6, 4.4, 2.9))
     boxes = _place_furniture(rng, size)
@@ -73,14 +75,14 @@ def make_room(seed: int) -> Room:
 def _make_face(
     rng: np.random.Generator, paint: Paint, center: np.ndarray, facing: str, width_m: float, height_m: float
 ) -> Quad:
-    """A rectangle of a size around a centre, its visible side facing along a world axis."""
+    """Make a rectangle of a size around a centre; its visible side faces along a world axis."""
     u, v = width_m * np.array(RIGHT[facing]), height_m * np.array(DOWN.get(facing, (0, 0, -1)))
     texture = paint(rng, round(height_m * TEXELS_PER_M), round(width_m * TEXELS_PER_M))
     return Quad(center - u / 2 - v / 2, u, v, texture)
 
 
 def _make_shell(rng: np.random.Generator, size: np.ndarray) -> Iterator[Quad]:
-    """Walls, floor, ceiling and a rug."""
+    """Make walls, floor, ceiling and a rug."""
     x, y, z = size
     main, side = textures.paint_bricks, textures.paint_wallpaper
     if rng.random() < 0.5:
@@ -96,7 +98,7 @@ def _make_shell(rng: np.random.Generator, size: np.ndarray) -> Iterator[Quad]:
 
 
 def _hang_pictures(rng: np.random.Generator, size: np.ndarray) -> Iterator[Quad]:
-    """One or two pictures in each slot of about a metre along every wall."""
+    """Make one picture, or two above each other, on each metre of every wall."""
     x, y, z = size
     for facing, wall, length in (
         ("-y", np.array([0, y / 2 - 0.01, 0]), x),
@@ -116,7 +118,11 @@ def _hang_pictures(rng: np.random.Generator, size: np.ndarray) -> Iterator[Quad]
 
 
 def _place_furniture(rng: np.random.Generator, size: np.ndarray) -> list[np.ndarray]:
-    """Boxes, (2, 3) lowest and highest corner: along the far wall, along both side walls, and upon those."""
+    """Choose boxes along the far wall and both side walls, and smaller boxes upon them.
+
+    Returns:
+        arrays (2, 3): lowest and highest corner of each box.
+    """
     x, y, _ = size
     standing: list[np.ndarray] = []
     at = -x / 2 + 0.05
@@ -144,7 +150,7 @@ def _place_furniture(rng: np.random.Generator, size: np.ndarray) -> list[np.ndar
 
 
 def _make_box_faces(rng: np.random.Generator, low: np.ndarray, high: np.ndarray) -> Iterator[Quad]:
-    """Four sides of one material, and a top."""
+    """Make the four sides of a box, of one material, and its top."""
     middle, (w, d, h) = (low + high) / 2, high - low
     if low[2] > 0:
         front: Paint = textures.paint_carton
@@ -162,7 +168,7 @@ def _make_box_faces(rng: np.random.Generator, low: np.ndarray, high: np.ndarray)
 
 
 def _bake_light(quad: Quad, size: np.ndarray, boxes: np.ndarray, lamps: np.ndarray) -> Quad:
-    """The rectangle with its light baked in: lamps behind soft shadows, and darker corners.
+    """Multiply a rectangle's texture by its light: two lamps with soft shadows, and darker corners.
 
     The light is computed on a grid of about 8 points a metre and interpolated.
     """
@@ -184,7 +190,7 @@ def _bake_light(quad: Quad, size: np.ndarray, boxes: np.ndarray, lamps: np.ndarr
 
 
 def _compute_openness(points: np.ndarray, size: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-    """In 0..1, smaller near walls and boxes: a stand-in for ambient occlusion."""
+    """Ambient light in 0..1, smaller near walls and boxes: an approximation of ambient occlusion."""
     above = points + size / 2 * (1, 1, 0)
     openness = np.prod([1 - 0.3 * np.exp(-gap / 0.25) for gap in (above, size - above)], axis=(0, -1))
     for low, high in boxes:
@@ -194,7 +200,7 @@ def _compute_openness(points: np.ndarray, size: np.ndarray, boxes: np.ndarray) -
 
 
 def _find_blocked(points: np.ndarray, rays: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-    """Whether the segment from each point along its ray hits a box (slab test)."""
+    """Whether a box intersects the segment from each point to the end of its ray (slab test)."""
     blocked = np.zeros(rays.shape[:-1], bool)
     inverse = 1 / np.where(np.abs(rays) < 1e-9, 1e-9, rays)
     for low, high in boxes:

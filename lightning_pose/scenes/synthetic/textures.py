@@ -1,6 +1,6 @@
-"""Surfaces of the synthetic room: walls, floors and furniture, rich at every scale and nowhere repeating.
+"""Textures of the synthetic room's walls, floors and furniture, with detail at every scale and without repetition.
 
-Every function takes a random generator and a size in pixels and returns an (H, W, 3) uint8 BGR image.
+Each `paint_` function takes a random generator and a size in pixels and returns an (H, W, 3) uint8 BGR image.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ WORDS = [
 
 
 def make_noise(rng: np.random.Generator, h: int, w: int, cells: tuple[float, ...] = (120, 36, 11, 4)) -> np.ndarray:
-    """(H, W) float32 fractal noise of about unit deviation: one smooth layer per cell size, in pixels."""
+    """Fractal noise, (H, W) float32, of about unit deviation: one smooth layer for each cell size in pixels."""
     total = np.zeros((h, w), np.float32)
     for cell in cells:
         grid = rng.standard_normal((int(h / cell) + 2, int(w / cell) + 2)).astype(np.float32)
@@ -100,7 +100,7 @@ def write_text(
 
 
 def paint_wallpaper(rng: np.random.Generator, h: int, w: int) -> np.ndarray:
-    """Stripes carrying flowers, no two of which have the same petals, colour and place."""
+    """Stripes with flowers, no two of which have the same petals, colour and place."""
     base, stripe = pick_color(rng, (0.55, 0.75), (0.03, 0.2)), pick_color(rng, (0.5, 0.8), (0.05, 0.3))
     pitch = int(rng.integers(70, 110))
     edges = np.arange(w) + 4 * make_noise(rng, 1, w, (200, 60))[0]
@@ -115,7 +115,7 @@ def paint_wallpaper(rng: np.random.Generator, h: int, w: int) -> np.ndarray:
 
 
 def paint_bricks(rng: np.random.Generator, h: int, w: int) -> np.ndarray:
-    """Running bond, each brick of its own shade, a few painted over."""
+    """Brick walls in running bond: each brick has its own shade, and a few another colour."""
     base, odd = _pick_wood_color(rng) * (0.95, 0.85, 1), np.array(pick_color(rng))
     image = _make_canvas(h, w, pick_color(rng, (0.6, 0.8), (0.0, 0.15)))
     height, length = int(rng.integers(22, 34)), int(rng.integers(60, 90))
@@ -147,7 +147,7 @@ def paint_planks(rng: np.random.Generator, h: int, w: int) -> np.ndarray:
 
 
 def paint_tiles(rng: np.random.Generator, h: int, w: int) -> np.ndarray:
-    """Square tiles; some carry an ornament, none exactly the same."""
+    """Square tiles, some with an ornament, no two of which are the same."""
     image = _make_canvas(h, w, pick_color(rng, (0.25, 0.4), (0.0, 0.2)))
     shades = [np.array(pick_color(rng, (0.4, 0.85), (0.05, 0.5))) for _ in range(3)]
     side = int(rng.integers(60, 90))
@@ -178,7 +178,7 @@ def paint_panels(rng: np.random.Generator, h: int, w: int) -> np.ndarray:
 
 
 def paint_rug(rng: np.random.Generator, h: int, w: int) -> np.ndarray:
-    """Borders around a field of diamonds and flowers."""
+    """Diamonds and flowers inside several borders."""
     image = _make_canvas(h, w, pick_color(rng, (0.3, 0.6)))
     for inset in np.cumsum(rng.integers(6, 16, 5)):
         cv2.rectangle(image, (inset, inset), (w - inset, h - inset), pick_color(rng), int(rng.integers(2, 7)))
@@ -243,11 +243,12 @@ def paint_carton(rng: np.random.Generator, h: int, w: int) -> np.ndarray:
 
 
 def shade_image(image: np.ndarray, factor: np.ndarray) -> np.ndarray:
-    """The image times (H, W) or (H, W, 3) factors, saturated, uint8."""
+    """Multiply an image by (H, W) or (H, W, 3) factors; clip to uint8."""
     return np.clip(image * (factor[..., None] if factor.ndim == 2 else factor), 0, 255).astype(np.uint8)
 
 
 def _make_canvas(h: int, w: int, fill: np.ndarray | tuple[float, float, float]) -> np.ndarray:
+    """An image of one BGR colour."""
     return np.full((h, w, 3), np.clip(fill, 0, 255), np.uint8)
 
 
@@ -257,7 +258,7 @@ def _fill_patch(image: np.ndarray, x0: int, y0: int, x1: int, y1: int, tone: np.
 
 
 def _add_wear(rng: np.random.Generator, image: np.ndarray, amount: float) -> np.ndarray:
-    """Wear at every scale: fractal shading, and small stains."""
+    """Add stains and fractal shading."""
     h, w = image.shape[:2]
     for _ in range(h * w // 5000):
         x, y = int(rng.integers(0, w)), int(rng.integers(0, h))
@@ -268,7 +269,7 @@ def _add_wear(rng: np.random.Generator, image: np.ndarray, amount: float) -> np.
 
 
 def _draw_flower(image: np.ndarray, rng: np.random.Generator, at: np.ndarray, r: float, ink: tuple) -> None:
-    """A closed curve with a random number of petals, and a centre of another colour."""
+    """Draw a closed curve with a random number of petals, and a centre of another colour."""
     angle = np.linspace(0, 2 * np.pi, 48, endpoint=False)
     petals, phase, depth = rng.integers(3, 9), rng.uniform(0, 6.3), rng.uniform(0.15, 0.6)
     radius = r * (1 - depth * np.cos(petals * angle + phase) ** 2)
@@ -283,6 +284,7 @@ def _make_grain(rng: np.random.Generator, h: int, w: int) -> np.ndarray:
 
 
 def _pick_wood_color(rng: np.random.Generator) -> np.ndarray:
+    """A random brown, BGR, (3,)."""
     return rng.uniform((45, 85, 130), (90, 135, 190)) * rng.uniform(0.7, 1.15)
 
 
@@ -293,4 +295,5 @@ def _divide_length(length: int, parts: int) -> tuple[list[int], list[int]]:
 
 
 def _round_point(at: np.ndarray) -> tuple[int, int]:
+    """A point's coordinates as OpenCV needs them."""
     return int(at[0]), int(at[1])
