@@ -31,7 +31,7 @@ def test_class_path_of_a_builtin() -> None:
 
 
 @pytest.mark.parametrize(
-    ("path", "init_args", "says"),
+    ("path", "init_args", "message"),
     [
         ("nowhere.Thing", {}, "nowhere.Thing cannot be imported .*; install"),
         ("tests.helpers.Thing", {}, "tests.helpers.Thing cannot be imported .*; install"),
@@ -39,8 +39,8 @@ def test_class_path_of_a_builtin() -> None:
         ("tests.helpers.Thumbnails", {"height": 3}, "does not take .*height.*; it was saved by another version"),
     ],
 )
-def test_what_cannot_be_rebuilt_is_refused(path: str, init_args: dict[str, Any], says: str) -> None:
-    with pytest.raises(CheckpointError, match=says):
+def test_what_cannot_be_rebuilt_is_refused(path: str, init_args: dict[str, Any], message: str) -> None:
+    with pytest.raises(CheckpointError, match=message):
         build_object({"class_path": path, "init_args": init_args})
 
 

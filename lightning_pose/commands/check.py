@@ -69,7 +69,7 @@ def _make_sequence_table(scene: Scene) -> Table:
 def _build_check_parser() -> VerbParser:
     parser = VerbParser(
         "check",
-        description="Say what a dataset holds and what is wrong with it. Exit code 0: usable; 2: it is not.",
+        description="Show what a dataset holds and what is wrong with it. Exit code 0: it is usable; 2: it is not.",
     )
     parser.add_argument("dir", metavar="DIR", type=Path, help="the scene's folder")
     formats = ", ".join(sorted(known_formats()))

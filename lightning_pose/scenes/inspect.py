@@ -136,10 +136,10 @@ def inspect_images(scene: Scene, files: list[ImageFile]) -> Findings:
     leaks = [(i, j) for i, j in copies if (split_of[i] == "test") != (split_of[j] == "test")]
     warnings = []
     for pairs, complaint in (
-        (copies, "images are copies of others (a camera that repeats frames does that)"),
+        (copies, "images are copies of others (some cameras repeat frames)"),
         (
             leaks,
-            "test images are also training or validation images, which flatters the result",
+            "test images are also training or validation images, which makes errors look smaller than they are",
         ),
     ):
         if pairs:

@@ -1,4 +1,4 @@
-"""Tests of the feature cache: each image once, whatever happens meanwhile."""
+"""Tests of the feature cache: each image is extracted once, also after errors, kills and damage."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def start_filling(images: Path, root: Path) -> subprocess.Popen[str]:
     )
 
 
-def go(process: subprocess.Popen[str]) -> None:
+def start_fill(process: subprocess.Popen[str]) -> None:
     assert process.stdin is not None
     assert process.stdout is not None
     assert process.stdout.readline() == "ready\n"
@@ -116,7 +116,7 @@ def test_settings_have_their_own_folder(tmp_path: Path) -> None:
     assert about["settings"] == {"scale": 2.0}
 
 
-def test_fewer_features_are_a_prefix_and_cost_nothing(tmp_path: Path) -> None:
+def test_fewer_features_are_a_prefix_and_nothing_is_extracted(tmp_path: Path) -> None:
     path = tmp_path / "noise.png"
     cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 256, (160, 200), np.uint8))
     many = FeatureCache(BRIEF(300), tmp_path / "cache").features([path])
@@ -194,7 +194,7 @@ def test_resumes_after_a_kill(tmp_path: Path) -> None:
     paths = write_images(tmp_path / "images", 100)
     root = tmp_path / "cache"
     with start_filling(tmp_path / "images", root) as process:
-        go(process)
+        start_fill(process)
         while len(records_in(root)) < 20:
             assert process.poll() is None
             time.sleep(0.005)
@@ -213,7 +213,7 @@ def test_two_processes_at_once(tmp_path: Path) -> None:
     paths = write_images(tmp_path / "images", 60)
     cache = FeatureCache(extractor := ColorMeans(seconds=0.02), tmp_path / "cache")
     with start_filling(tmp_path / "images", cache.root) as other:
-        go(other)
+        start_fill(other)
         np.testing.assert_array_equal(cache.features(paths, workers=2, progress=False), expected(60))
         report, _ = other.communicate(timeout=60)
     assert other.returncode == 0

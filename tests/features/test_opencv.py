@@ -1,4 +1,4 @@
-"""Tests of OpenCV's features behind the extractor contract, all four alike."""
+"""Tests of the extractors of OpenCV's four kinds of features."""
 
 from __future__ import annotations
 

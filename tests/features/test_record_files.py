@@ -1,4 +1,4 @@
-"""Tests of the record files: whole, or known to be damaged."""
+"""Tests of record files: read whole, or reported as damaged."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ def _choose_format(root: Path, name: str | None) -> SceneFormat:
         return formats[name]
     matching = _find_matching_formats(root)
     if len(matching) > 1:
-        raise DataError(f"{root} may be {' or '.join(matching)}; say which with `format`")
+        raise DataError(f"{root} may be {' or '.join(matching)}; give one of them as `format`")
     if matching:
         return formats[matching[0]]
     scenes = [child.name for child in sorted(root.iterdir()) if child.is_dir() and _find_matching_formats(child)]

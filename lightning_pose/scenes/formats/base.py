@@ -163,7 +163,7 @@ def require_images(paths: Iterable[Path], listed_in: str) -> None:
     if missing:
         raise ImageError(
             f"{missing[0]} is missing, listed in {listed_in} ({len(missing)} such images); "
-            "unpack the images there or take them off the list"
+            "unpack the images there or remove them from the list"
         )
 
 

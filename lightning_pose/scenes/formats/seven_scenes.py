@@ -112,4 +112,4 @@ def _read_intrinsics(root: Path) -> Intrinsics:
         camera = json.loads(path.read_text())["intrinsics"]
         return Intrinsics(**{name: float(camera[name]) for name in ("fx", "fy", "cx", "cy")})
     except (ValueError, KeyError, TypeError) as error:
-        raise DataError(f"{path}: no `intrinsics` of fx, fy, cx, cy ({error!r}); render it anew") from error
+        raise DataError(f"{path}: no `intrinsics` of fx, fy, cx, cy ({error!r}); render the room again") from error

@@ -255,7 +255,7 @@ def test_records() -> None:
 
 
 @pytest.mark.parametrize(
-    ("images", "says"),
+    ("images", "message"),
     [
         (torch.zeros((40, 50), dtype=torch.uint8), r"\(40, 50\).*image\[None\]"),
         (torch.zeros((1, 3, 40, 50), dtype=torch.uint8), r"\(1, 3, 40, 50\).*\(B, H, W\)"),
@@ -266,8 +266,8 @@ def test_records() -> None:
         (torch.full((1, 40, 50), torch.nan), r"nan.*0..1"),
     ],
 )
-def test_wrong_images(images: Tensor, says: str) -> None:
-    with pytest.raises(ImageError, match=says):
+def test_wrong_images(images: Tensor, message: str) -> None:
+    with pytest.raises(ImageError, match=message):
         SURF(20)(images)
 
 
@@ -280,13 +280,13 @@ def test_wrong_arrays(wrong: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "says"),
+    ("settings", "message"),
     [
         ({"n_features": 0}, "n_features is 0"),
         ({"threshold": -1.0}, "threshold is -1.0; give 0"),
         ({"threshold": float("nan")}, "nan"),
     ],
 )
-def test_wrong_settings(settings: dict, says: str) -> None:
-    with pytest.raises(ConfigError, match=says):
+def test_wrong_settings(settings: dict, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         SURF(**settings)

@@ -59,7 +59,7 @@ def test_image_list_is_used_where_there_is_one(tmp_path: Path) -> None:
     assert [f.index for f in load_scene(tmp_path, val_fraction=0).frames] == [1, 2]
 
 
-def test_numbered_groundtruth_is_recognised_and_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_numbered_groundtruth_is_recognised_with_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     write(tmp_path, "groundtruth.txt")
     (tmp_path / "rgb.txt").write_text("1 rgb/1.png\n2 rgb/2.png\n3 rgb/3.png\n")
     with caplog.at_level(logging.WARNING, "lightning_pose"):

@@ -43,9 +43,9 @@ def test_layout_is_that_of_7_scenes(room: Path) -> None:
     assert image is not None
     assert image.shape == (48, 64, 3)
     assert image.std() > 20
-    told = json.loads((room / "synthetic.json").read_text())
-    assert (told["seed"], told["frames"], told["size"]) == (0, FRAMES, [64, 48])
-    assert told["intrinsics"] == {"fx": 52.5, "fy": 52.5, "cx": 31.5, "cy": 23.5}
+    written = json.loads((room / "synthetic.json").read_text())
+    assert (written["seed"], written["frames"], written["size"]) == (0, FRAMES, [64, 48])
+    assert written["intrinsics"] == {"fx": 52.5, "fy": 52.5, "cx": 31.5, "cy": 23.5}
 
 
 def test_poses_are_rigid_and_inside_the_room(room: Path) -> None:
