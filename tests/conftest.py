@@ -16,7 +16,7 @@ if TYPE_CHECKING:  # they take seconds to import, and most tests do without
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported: each test process has one core
 
-shapes.turn_on()
+shapes.turn_on_checks()
 
 
 @pytest.fixture(autouse=True, scope="session")

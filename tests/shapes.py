@@ -8,15 +8,15 @@ from typing import Any
 from beartype import BeartypeConf, beartype
 from jaxtyping import install_import_hook
 
-__all__ = ["check_shapes", "turn_on"]
+__all__ = ["check_shapes", "turn_on_checks"]
 
 CHECKED = ["lightning_pose.geometry", "lightning_pose.losses"]
 
-# The tower: where a signature says float, an int will do.
+# With the numeric tower of PEP 484, an int is accepted where a signature says float.
 check_all = beartype(conf=BeartypeConf(is_pep484_tower=True))
 
 
-def turn_on() -> None:
+def turn_on_checks() -> None:
     """Check the signatures of modules in `CHECKED`; call it before anything imports them."""
     install_import_hook(CHECKED, "tests.shapes.check_shapes")
 

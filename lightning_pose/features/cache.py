@@ -23,7 +23,13 @@ from rich.text import Text
 
 from lightning_pose.errors import ConfigError, ImageError
 from lightning_pose.features.base import FeatureExtractor, Record
-from lightning_pose.features.record_files import TEMPORARY, DamagedError, read_record, write_record, write_whole
+from lightning_pose.features.record_files import (
+    TEMPORARY,
+    DamagedError,
+    read_record,
+    write_file_atomically,
+    write_record,
+)
 from lightning_pose.paths import cache_folder
 from lightning_pose.scenes.images import decode_image, read_bytes
 
@@ -253,7 +259,7 @@ class _Job:
 
 def _prepare_folder(folder: Path, about: str) -> None:
     """Make the folder and its settings.json, and delete temporary files of processes that were killed."""
-    write_whole(folder / "settings.json", about.encode())
+    write_file_atomically(folder / "settings.json", about.encode())
     for temporary in folder.glob(f"**/*{TEMPORARY}"):
         with suppress(OSError):  # another process may delete it first
             if time.time() - temporary.stat().st_mtime > _STALE_SECONDS:

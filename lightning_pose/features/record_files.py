@@ -14,7 +14,7 @@ from safetensors.numpy import save
 from lightning_pose.errors import CacheError
 from lightning_pose.features.base import Record
 
-__all__ = ["TEMPORARY", "DamagedError", "read_record", "write_record", "write_whole"]
+__all__ = ["TEMPORARY", "DamagedError", "read_record", "write_file_atomically", "write_record"]
 
 TEMPORARY = ".tmp"
 """Suffix of a file that is being written."""
@@ -50,14 +50,14 @@ def write_record(file: Path, record: Record) -> None:
     """Write a record as a safetensors file with its checksum in the metadata.
 
     Raises:
-        CacheError: as `write_whole`.
+        CacheError: as `write_file_atomically`.
     """
     # safetensors writes an array in its memory order, so a transposed array would be saved transposed.
     record = {name: np.asarray(array, order="C") for name, array in record.items()}
-    write_whole(file, save(record, {"checksum": _compute_checksum(record)}))
+    write_file_atomically(file, save(record, {"checksum": _compute_checksum(record)}))
 
 
-def write_whole(file: Path, data: bytes) -> None:
+def write_file_atomically(file: Path, data: bytes) -> None:
     """Write a file under a temporary name and rename it, so that no process reads a part of it; make its folder.
 
     Raises:

@@ -16,8 +16,8 @@ from lightning_pose.scenes.scene import Frame, Scene
 
 __all__ = [
     "SceneFormat",
-    "natural_key",
-    "poses_from_matrices",
+    "convert_matrices",
+    "make_natural_key",
     "read_lines",
     "read_table",
     "require_images",
@@ -102,7 +102,7 @@ def read_table(path: Path, columns: str) -> tuple[np.ndarray, list[str]]:
     return np.array(rows, dtype=np.float64).reshape(-1, len(columns.split())), where
 
 
-def poses_from_matrices(T_world_cam: np.ndarray, where: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+def convert_matrices(T_world_cam: np.ndarray, where: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
     """Positions and quaternions of (N, 4, 4) camera-to-world matrices.
 
     A matrix that is a rotation except for rounding errors is replaced by the nearest rotation (SVD).
@@ -167,14 +167,14 @@ def require_images(paths: Iterable[Path], listed_in: str) -> None:
         )
 
 
-def natural_key(text: str) -> list[tuple[int, str]]:
+def make_natural_key(text: str) -> list[tuple[int, str]]:
     """Key for sorting by the numbers in a text: `seq2` comes before `seq10`."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", text)]
 
 
 def sort_frames(frames: Iterable[Frame]) -> tuple[Frame, ...]:
     """Sort frames as a `Scene` needs them: by sequence, and by index within each sequence."""
-    return tuple(sorted(frames, key=lambda frame: (natural_key(frame.sequence), frame.index)))
+    return tuple(sorted(frames, key=lambda frame: (make_natural_key(frame.sequence), frame.index)))
 
 
 def _make_canonical_quats(rotation: Rotation) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 from lightning_pose.errors import DataError
 from lightning_pose.scenes.formats.base import (
     SceneFormat,
-    natural_key,
+    make_natural_key,
     read_lines,
     read_table,
     require_images,
@@ -108,7 +108,7 @@ def _find_images(root: Path) -> dict[int, Path]:
     if lists:
         paths = [root / line.split()[-1] for _, line in read_lines(lists[0])]
     else:
-        paths = sorted((root / "rgb").glob("*.png"), key=lambda path: natural_key(path.name))
+        paths = sorted((root / "rgb").glob("*.png"), key=lambda path: make_natural_key(path.name))
     for path in paths:
         if not path.stem.isdecimal():
             raise DataError(f"{path} is not named by its frame's number; rename it like rgb/1.png")

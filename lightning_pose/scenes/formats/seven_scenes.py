@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from lightning_pose.errors import DataError
-from lightning_pose.scenes.formats.base import SceneFormat, poses_from_matrices, read_lines, sort_frames
+from lightning_pose.scenes.formats.base import SceneFormat, convert_matrices, read_lines, sort_frames
 from lightning_pose.scenes.scene import Frame, Intrinsics, Scene
 
 __all__ = ["FORMAT", "SevenScenes"]
@@ -87,7 +87,7 @@ def _read_sequence(folder: Path, intrinsics: Intrinsics) -> list[Frame]:
             raise DataError(f"{images[index]} has no .pose.txt beside it; add it or drop the image")
         raise DataError(f"{poses[index]} has no image beside it; add it or drop the pose")
     where = [str(poses[index]) for index in images]
-    positions, quats = poses_from_matrices(np.stack([_read_matrix(poses[i]) for i in images]), where)
+    positions, quats = convert_matrices(np.stack([_read_matrix(poses[i]) for i in images]), where)
     return [
         Frame(path, position, quat, folder.name, index, intrinsics=intrinsics)
         for (index, path), position, quat in zip(images.items(), positions, quats, strict=True)

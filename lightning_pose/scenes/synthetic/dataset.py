@@ -18,7 +18,7 @@ from lightning_pose.scenes.synthetic.render import Renderer, make_camera
 from lightning_pose.scenes.synthetic.room import make_room
 from lightning_pose.scenes.synthetic.trajectory import Walk, is_test, make_walks
 
-__all__ = ["METADATA", "MIN_FRAMES", "RENDERER_VERSION", "render_room", "sequence_lengths"]
+__all__ = ["METADATA", "MIN_FRAMES", "RENDERER_VERSION", "divide_frames", "render_room"]
 
 METADATA = "synthetic.json"
 RENDERER_VERSION = 1
@@ -86,7 +86,7 @@ def render_room(
     return root
 
 
-def sequence_lengths(frames: int) -> list[int]:
+def divide_frames(frames: int) -> list[int]:
     """Frames per sequence: about 30 up to 300 frames, then ten longer ones, then more of 100."""
     count = max(3, min(10, frames // 30), -(-frames // 100))
     return [len(part) for part in np.array_split(np.arange(frames), count)]
@@ -128,7 +128,7 @@ def _write_room(
     root: Path, seed: int, frames: int, size: tuple[int, int], progress: Callable[[int, int], None] | None
 ) -> None:
     """Write all files of the room but its metadata; arguments as for `render_room`."""
-    room, lengths = make_room(seed), sequence_lengths(frames)
+    room, lengths = make_room(seed), divide_frames(frames)
     renderer = Renderer(room.quads, make_camera(size), size)
     walks = make_walks(seed, room.size_m, lengths)
     root.mkdir()
