@@ -9,14 +9,17 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests import shapes
-
 if TYPE_CHECKING:  # they take seconds to import, and most tests do without
     from tests.helpers import Trained, Workplace
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported: each test process has one core
 
-shapes.turn_on_checks()
+
+def pytest_configure() -> None:
+    """Check shapes in signatures; before a test imports the modules."""
+    from tests import shapes
+
+    shapes.turn_on_checks()
 
 
 @pytest.fixture(autouse=True, scope="session")

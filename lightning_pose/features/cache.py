@@ -2,48 +2,27 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
-import logging
 import os
-import random
 import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
-import torch
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TimeRemainingColumn
-from rich.text import Text
 
 from lightning_pose.errors import ConfigError, ImageError
 from lightning_pose.features.base import FeatureExtractor, Record
-from lightning_pose.features.record_files import (
-    TEMPORARY,
-    DamagedError,
-    read_record,
-    write_file_atomically,
-    write_record,
-)
+from lightning_pose.features.fill_job import FillJob, ImagePath, Visit, hash_bytes
+from lightning_pose.features.record_files import TEMPORARY, write_file_atomically
 from lightning_pose.paths import cache_folder
-from lightning_pose.scenes.images import decode_image, read_bytes
 
 __all__ = ["FeatureCache", "FillReport"]
 
-ImagePath = Path | str
-Visit = Callable[[list[int], Record], None]
-"""Called with the numbers of all images that have one content, and their record; from several threads."""
-
 _FORMAT = 1  # raise it when what a record's file holds changes
-_BATCH = 8  # images per call of extract: enough for a GPU, few enough to spread over the cores
 _CHUNK = 64  # records held in memory while iterating
 _STALE_SECONDS = 3600  # the writer of a temporary file this old was killed
-_log = logging.getLogger("lightning_pose")
 
 
 @dataclass(frozen=True)
@@ -88,7 +67,7 @@ class FeatureCache:
         self.root = Path(root).expanduser() if root else cache_folder("features")
         self._about = {"format": _FORMAT, "name": extractor.name, "settings": dict(extractor.settings)}
         canonical = json.dumps(self._about, sort_keys=True, separators=(",", ":"))
-        self.folder = self.root / f"{extractor.name}-{_hash_bytes(canonical.encode(), 8)}"
+        self.folder = self.root / f"{extractor.name}-{hash_bytes(canonical.encode(), 8)}"
 
     def fill(self, paths: Sequence[ImagePath], workers: int | None = None, progress: bool = True) -> FillReport:
         """Extract what the cache lacks; a run after an interrupted one continues where that stopped.
@@ -140,7 +119,7 @@ class FeatureCache:
         """Call `visit` with the record of every distinct image, read from disk or else extracted and saved."""
         if workers is not None and workers < 1:
             raise ConfigError(f"workers is {workers}; give the number of threads to extract with, 1 or more")
-        job = _Job(self.extractor, self.folder, paths, visit, workers or _count_cores())
+        job = FillJob(self.extractor, self.folder, paths, visit, workers or _count_cores())
         job.read()
         started = time.perf_counter()
         if job.missing or job.damaged:
@@ -158,105 +137,6 @@ class FeatureCache:
         )
 
 
-@dataclass
-class _Job:
-    """One pass over some images: read what the cache holds, extract the rest.
-
-    Attributes:
-        numbers: content key to the numbers of all images with that content.
-        missing, damaged: keys that must be extracted.
-        bad: image number to the error of reading the image.
-        computed, redone: extractions done so far, of missing and of damaged ones.
-    """
-
-    extractor: FeatureExtractor
-    folder: Path
-    paths: Sequence[ImagePath]
-    visit: Visit
-    workers: int
-    numbers: dict[str, list[int]] = field(default_factory=dict)
-    missing: set[str] = field(default_factory=set)
-    damaged: set[str] = field(default_factory=set)
-    bad: dict[int, ImageError] = field(default_factory=dict)
-    computed: int = 0
-    redone: int = 0
-
-    def read(self) -> None:
-        """Find each image's key, visit the records that the cache holds, and note those to extract."""
-        with ThreadPoolExecutor(self.workers) as pool:
-            for number, key in enumerate(pool.map(self._key, range(len(self.paths)))):
-                if key:
-                    self.numbers.setdefault(key, []).append(number)
-            held = list(pool.map(self._held, self.numbers))
-        self.missing = {key for key, there in zip(self.numbers, held, strict=True) if not there} - self.damaged
-
-    def extract(self, progress: bool) -> None:
-        """Extract, save and visit all that is missing or damaged, in batches spread over the threads."""
-        todo = [*self.missing, *self.damaged]
-        random.SystemRandom().shuffle(todo)  # so that processes that fill one cache rarely extract the same image
-        size = min(_BATCH, -(-len(todo) // self.workers))
-        batches = [todo[start : start + size] for start in range(0, len(todo), size)]
-        workers = min(self.workers, len(batches))
-        with _make_extraction_bar(progress) as bar, _set_inner_threads(max(1, self.workers // workers)):
-            task = bar.add_task(f"{self.extractor.name} features", total=len(todo))
-            pool = ThreadPoolExecutor(workers)
-            try:
-                futures = {pool.submit(self._extract, batch): batch for batch in batches}
-                for done in as_completed(futures):
-                    self.computed += len(done.result() - self.damaged)
-                    self.redone += len(done.result() & self.damaged)
-                    bar.advance(task, len(futures[done]))
-            finally:
-                pool.shutdown(cancel_futures=True)  # after an error or Ctrl-C, finish only the batches under way
-
-    def _key(self, number: int) -> str | None:
-        try:
-            return _hash_bytes(read_bytes(self.paths[number]))
-        except ImageError as error:
-            self.bad[number] = error
-            return None
-
-    def _file(self, key: str) -> Path:
-        return self.folder / key[:2] / f"{key}.safetensors"
-
-    def _held(self, key: str) -> bool:
-        """Visit the record of `key` if the cache holds it whole."""
-        file = self._file(key)
-        try:
-            record = read_record(file)
-        except DamagedError as error:
-            _log.warning("%s is damaged (%s); its image is extracted again", file, error)
-            self.damaged.add(key)
-            return False
-        if record is None:
-            return False
-        self.visit(self.numbers[key], record)
-        return True
-
-    def _extract(self, batch: list[str]) -> set[str]:
-        """Extract one batch; returns the keys that were computed here."""
-        images: dict[str, np.ndarray] = {}
-        for key in batch:
-            if key in self.missing and self._held(key):
-                continue  # another process has saved it meanwhile
-            number = self.numbers[key][0]
-            try:
-                images[key] = self._image(self.paths[number], key)
-            except ImageError as error:
-                self.bad[number] = error
-        records = self.extractor.extract(list(images.values())) if images else []
-        for key, record in zip(images, records, strict=True):
-            write_record(self._file(key), record)
-            self.visit(self.numbers[key], record)
-        return set(images)
-
-    def _image(self, path: ImagePath, key: str) -> np.ndarray:
-        data = read_bytes(path)
-        if _hash_bytes(data) != key:
-            raise ImageError(f"{path} changed while it was read; run again when nothing writes to it")
-        return decode_image(data, path, color=self.extractor.color == "rgb")
-
-
 def _prepare_folder(folder: Path, about: str) -> None:
     """Make the folder and its settings.json, and delete temporary files of processes that were killed."""
     write_file_atomically(folder / "settings.json", about.encode())
@@ -264,11 +144,6 @@ def _prepare_folder(folder: Path, about: str) -> None:
         with suppress(OSError):  # another process may delete it first
             if time.time() - temporary.stat().st_mtime > _STALE_SECONDS:
                 temporary.unlink()
-
-
-def _hash_bytes(data: bytes, size: int = 20) -> str:
-    """BLAKE2b digest of `size` bytes, in hexadecimal digits."""
-    return hashlib.blake2b(data, digest_size=size).hexdigest()
 
 
 def _count_cores() -> int:
@@ -282,35 +157,3 @@ def _join_errors(errors: list[ImageError], total: int) -> str:
         return str(errors[0])
     named = "; ".join(str(error) for error in errors[:3]) + ("; ..." if len(errors) > 3 else "")
     return f"{len(errors)} of {total} images cannot be read: {named}"
-
-
-@contextmanager
-def _set_inner_threads(count: int) -> Iterator[None]:
-    """Set the number of threads that torch and OpenCV start inside each thread of ours, and restore it afterwards."""
-    before = torch.get_num_threads(), cv2.getNumThreads()
-    torch.set_num_threads(count)
-    cv2.setNumThreads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before[0])
-        cv2.setNumThreads(before[1])
-
-
-class _RateColumn(ProgressColumn):
-    """Shows images per second."""
-
-    def render(self, task: Task) -> Text:
-        return Text(f"{task.speed:.1f} images/s" if task.speed else "", style="progress.data.speed")
-
-
-def _make_extraction_bar(shown: bool) -> Progress:
-    return Progress(
-        "{task.description}",
-        BarColumn(),
-        MofNCompleteColumn(),
-        _RateColumn(),
-        TimeRemainingColumn(),
-        console=Console(stderr=True),
-        disable=not shown,
-    )

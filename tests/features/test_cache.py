@@ -18,7 +18,7 @@ import pytest
 import torch
 
 from lightning_pose.errors import CacheError, ConfigError, ImageError
-from lightning_pose.features import cache as cache_module
+from lightning_pose.features import fill_job
 from lightning_pose.features.base import Record
 from lightning_pose.features.cache import FeatureCache
 from lightning_pose.features.opencv import BRIEF
@@ -183,7 +183,7 @@ def test_one_bad_image_gives_its_own_error(tmp_path: Path) -> None:
 def test_image_that_changes_meanwhile_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     first, second = write_images(tmp_path / "images", 2)
     contents = iter([first.read_bytes(), second.read_bytes()])
-    monkeypatch.setattr(cache_module, "read_bytes", lambda path: next(contents))
+    monkeypatch.setattr(fill_job, "read_bytes", lambda path: next(contents))
     cache = FeatureCache(ColorMeans(), tmp_path / "cache")
     with pytest.raises(ImageError, match=r"000\.png changed while it was read; run again"):
         cache.fill([first], progress=False)
