@@ -128,6 +128,7 @@ class PoseLoss(nn.Module):
         return {**terms, "total": total}
 
     def _norm(self, error: Tensor) -> Tensor:
+        """Norm of errors (..., D), plain or squared as configured: (...)."""
         if self.config.norm == "squared":
             return error.square().sum(-1)
         # Its gradient at 0 is 0; that of the square root of a sum of squares is NaN.

@@ -45,6 +45,7 @@ class Sheet:
         console.print(self._table(None, columns) if exchange else self._table(self.heads, self.rows))
 
     def _table(self, heads: Sequence[str] | None, rows: Sequence[Sequence[str]]) -> Table:
+        """Make a table of these rows; without `heads` the first column holds them, aligned left."""
         caption = None if self.caption is None else escape(self.caption)
         table = Table(
             title=escape(self.title),

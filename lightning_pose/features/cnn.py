@@ -32,8 +32,8 @@ class CNN(FeatureExtractor):
     """A frozen CNN's last feature map (C, h, w), or its mean over all cells, (C,).
 
     A record holds `features`: float32 for a vector, float16 for a map, which is large (ResNet50's 7 x 7 x 2048
-    are 200 kB). The network is loaded by the first call of `extract` and runs on the GPU where there is one,
-    there in half precision.
+    are 200 kB). The network is loaded by the first call of `extract` and runs on the GPU if there is one, in
+    half precision.
 
     Args:
         backbone: a name of `lightning_pose.features.backbones.BACKBONES`, or the class path of any
@@ -148,10 +148,12 @@ class CNN(FeatureExtractor):
 
     @property
     def _side(self) -> int:
+        """Side of the square image that the network gets, in pixels."""
         return self.size or BACKBONES.get(self.backbone, BACKBONES["resnet50"]).size
 
     @property
     def _network(self) -> nn.Module:
+        """The CNN, which is built by the first call."""
         with _LOADING:  # the cache extracts with several threads
             if self._loaded is None:
                 network = build_backbone(self.backbone, self.weights).eval().requires_grad_(False).to(_choose_device())
@@ -180,14 +182,17 @@ class CNN(FeatureExtractor):
 
 
 def _resize_images(rgb: Tensor, height: int, width: int) -> Tensor:
+    """Resize images (B, 3, H, W) by bilinear interpolation with antialiasing."""
     return F.interpolate(rgb, (height, width), mode="bilinear", antialias=True)
 
 
 def _choose_device() -> torch.device:
+    """The GPU if there is one, else the CPU."""
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
 def _hash_weights(network: nn.Module) -> str:
+    """Digest of the names and values of all parameters and buffers."""
     digest = hashlib.blake2b(digest_size=8)
     for name, value in network.state_dict().items():
         digest.update(name.encode() + value.cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes())

@@ -105,6 +105,7 @@ class FillJob:
             return None
 
     def _record_file(self, key: str) -> Path:
+        """The file of a key's record."""
         return self.folder / key[:2] / f"{key}.safetensors"
 
     def _visit_record(self, key: str) -> bool:

@@ -49,6 +49,7 @@ class _OpenCVExtractor(LocalExtractor):
         """
 
     def _record(self, image: np.ndarray, describe: Describe) -> Record:
+        """Describe one image, sort its keypoints, and fill up with zero rows."""
         keypoints = np.zeros((self.n_stored, 5), np.float32)
         descriptors = np.zeros((self.n_stored, self.descriptor_dim), np.float32)
         found, raw = describe(image) if min(image.shape) >= _SMALLEST_SIDE else ((), None)

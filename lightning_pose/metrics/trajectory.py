@@ -151,6 +151,7 @@ def _measure_errors(hat: Poses, truth: Poses) -> dict[str, float]:
 
 
 def _compute_rms(errors: np.ndarray) -> float:
+    """Root mean square of errors."""
     return math.sqrt(np.mean(errors**2))
 
 

@@ -69,6 +69,7 @@ class _Candidates(NamedTuple):
     col: Tensor
 
     def pick(self, which: Tensor) -> _Candidates:
+        """The candidates at these indices."""
         return _Candidates(*(column[which] for column in self))
 
 

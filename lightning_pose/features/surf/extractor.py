@@ -79,7 +79,7 @@ class SURF(LocalExtractor):
         Raises:
             ImageError: another number of axes, no pixels, another type, or floats outside 0..1.
         """
-        return self._run(_convert_to_uint8(images), self.n_features)
+        return self._compute_features(_convert_to_uint8(images), self.n_features)
 
     @torch.no_grad()
     def extract(self, images: Sequence[np.ndarray]) -> list[Record]:
@@ -98,7 +98,7 @@ class SURF(LocalExtractor):
         records: list[Record] = [{}] * len(images)
         for (height, width), members in alike.items():
             batch = torch.from_numpy(np.stack([images[i] for i in members]))
-            found = self._run(batch, self.n_stored)
+            found = self._compute_features(batch, self.n_stored)
             for i, keypoints, descriptors, count in zip(members, *(f.numpy() for f in found), strict=True):
                 records[i] = {
                     "descriptors": descriptors,
@@ -124,11 +124,13 @@ class SURF(LocalExtractor):
         rest[..., :1] = -rest[..., :1]
         return torch.cat([cells.flatten(-3), rest], dim=-1)
 
-    def _run(self, gray: Tensor, n: int) -> SurfFeatures:
-        chunks = [self._chunk(chunk, n) for chunk in gray.split(1 if gray.device.type == "cpu" else BATCH)]
-        return SurfFeatures(*(torch.cat(column) for column in zip(*chunks, strict=True)))
+    def _compute_features(self, gray: Tensor, n: int) -> SurfFeatures:
+        """Compute the n strongest features of images (B, H, W) uint8, batch by batch."""
+        batches = [self._compute_batch(batch, n) for batch in gray.split(1 if gray.device.type == "cpu" else BATCH)]
+        return SurfFeatures(*(torch.cat(column) for column in zip(*batches, strict=True)))
 
-    def _chunk(self, gray: Tensor, n: int) -> SurfFeatures:
+    def _compute_batch(self, gray: Tensor, n: int) -> SurfFeatures:
+        """Compute the n strongest features of the images of one batch."""
         integral = compute_integral_image(gray)
         found = detect_keypoints(integral, n, self.threshold)
         image = torch.arange(len(gray), device=gray.device).repeat_interleave(n)

@@ -76,4 +76,5 @@ def _choose_format(root: Path, name: str | None) -> SceneFormat:
 
 
 def _find_matching_formats(root: Path) -> list[str]:
+    """Names of the formats that the folder matches."""
     return [name for name, format in known_formats().items() if format.matches(root)]
