@@ -1,4 +1,4 @@
-"""Shapes in signatures are checked while tests run, and cost users nothing."""
+"""Shapes in signatures are checked while tests run, and not in use."""
 
 from __future__ import annotations
 
@@ -45,6 +45,11 @@ def test_only_batches_that_broadcast_are_taken() -> None:
     assert orientation_error_deg(QUATS[:, None], QUATS[:2]).shape == (5, 2)
     with pytest.raises(TypeCheckError, match="parameter 'b'"):
         quat_multiply(QUATS, QUATS[:2])
+
+
+def test_commands_that_need_no_torch_do_not_import_jaxtyping() -> None:
+    code = "import sys, lightning_pose, lightning_pose.commands.check; sys.exit('jaxtyping' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def test_nothing_is_checked_outside_of_tests() -> None:
