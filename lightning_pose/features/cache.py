@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -14,7 +13,7 @@ import numpy as np
 
 from lightning_pose.errors import ConfigError, ImageError
 from lightning_pose.features.base import FeatureExtractor, Record
-from lightning_pose.features.fill_job import FillJob, ImagePath, Visit, hash_bytes
+from lightning_pose.features.fill_job import FillJob, ImagePath, Visit, count_cores, hash_bytes
 from lightning_pose.features.record_files import TEMPORARY, write_file_atomically
 from lightning_pose.paths import cache_folder
 
@@ -119,7 +118,7 @@ class FeatureCache:
         """Call `visit` with the record of every distinct image, read from disk or else extracted and saved."""
         if workers is not None and workers < 1:
             raise ConfigError(f"workers is {workers}; give the number of threads to extract with, 1 or more")
-        job = FillJob(self.extractor, self.folder, paths, visit, workers or _count_cores())
+        job = FillJob(self.extractor, self.folder, paths, visit, workers or count_cores())
         job.read()
         started = time.perf_counter()
         if job.missing or job.damaged:
@@ -144,11 +143,6 @@ def _prepare_folder(folder: Path, about: str) -> None:
         with suppress(OSError):  # another process may delete it first
             if time.time() - temporary.stat().st_mtime > _STALE_SECONDS:
                 temporary.unlink()
-
-
-def _count_cores() -> int:
-    """Number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _join_errors(errors: list[ImageError], total: int) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import os
 import random
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -23,7 +24,7 @@ from lightning_pose.features.base import FeatureExtractor, Record
 from lightning_pose.features.record_files import DamagedError, read_record, write_record
 from lightning_pose.scenes.images import decode_image, read_bytes
 
-__all__ = ["FillJob", "ImagePath", "Visit", "hash_bytes"]
+__all__ = ["FillJob", "ImagePath", "Visit", "count_cores", "hash_bytes"]
 
 ImagePath = Path | str
 Visit = Callable[[list[int], Record], None]
@@ -38,6 +39,11 @@ log = logging.getLogger("lightning_pose")
 def hash_bytes(data: bytes, size: int = 20) -> str:
     """BLAKE2b digest of `size` bytes, in hexadecimal digits."""
     return hashlib.blake2b(data, digest_size=size).hexdigest()
+
+
+def count_cores() -> int:
+    """Number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @dataclass

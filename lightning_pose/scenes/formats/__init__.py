@@ -48,12 +48,12 @@ def load_scene(
     root = Path(root).expanduser()
     if not root.is_dir():
         raise DataError(f"{root} is not a folder; give the folder of a scene")
-    scene = _choose_format(root, format).read(root)
+    scene = _choose_scene_format(root, format).read(root)
     source = "official" if scene.splits else "blocks"
     return replace(scene, splits=make_splits(scene, val_fraction, test_fraction, val_block), split_source=source)
 
 
-def _choose_format(root: Path, name: str | None) -> SceneFormat:
+def _choose_scene_format(root: Path, name: str | None) -> SceneFormat:
     """The format of that name; without a name, the only one that the folder matches."""
     formats = known_formats()
     if name is not None:
