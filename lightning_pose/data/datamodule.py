@@ -11,7 +11,7 @@ import torch
 from lightning import LightningDataModule
 from torch.utils.data import DataLoader
 
-from lightning_pose.checkpoint import describe
+from lightning_pose.checkpoint import describe_object
 from lightning_pose.data.batches import PoseBatch, PoseDataset, batch_loader
 from lightning_pose.errors import ConfigError, DataError
 from lightning_pose.features import FeatureCache, FeatureExtractor
@@ -131,8 +131,8 @@ class SceneDataModule(LightningDataModule):
 
     def describe(self) -> dict[str, Any]:
         """Plain settings that rebuild this data module; checkpoints carry them."""
-        spec = describe(self)
-        spec["init_args"]["extractor"] = describe(self.extractor)
+        spec = describe_object(self)
+        spec["init_args"]["extractor"] = describe_object(self.extractor)
         return spec
 
 

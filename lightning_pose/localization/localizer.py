@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 import torch
 
-from lightning_pose.checkpoint import build, read_checkpoint
+from lightning_pose.checkpoint import build_object, read_checkpoint
 from lightning_pose.errors import CheckpointError
 from lightning_pose.features.base import FeatureExtractor
 from lightning_pose.geometry.relative import RelativeFrame
@@ -48,11 +48,11 @@ class Localizer:
         specs = checkpoint["lightning_pose"]
         if specs["data"] is None:
             raise CheckpointError(f"{path} does not say which features it reads; train with a data module")
-        model: PoseModule = build(specs["model"])
+        model: PoseModule = build_object(specs["model"])
         model.load_state_dict(checkpoint["state_dict"])
         data = specs["data"]["init_args"]
         clips = (data["clip_length"], data["relative_frame"]) if "clip_length" in data else None
-        return cls(build(data["extractor"]), model, clips)
+        return cls(build_object(data["extractor"]), model, clips)
 
     def __call__(self, images: Sequence[str | Path | np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Locate images.

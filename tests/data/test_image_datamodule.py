@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from lightning_pose.checkpoint import build
+from lightning_pose.checkpoint import build_object
 from lightning_pose.data import ImageDataModule, datamodule
 from lightning_pose.errors import ConfigError, DataError, ImageError
 from lightning_pose.features import ORB
@@ -122,14 +122,14 @@ def test_without_a_folder_a_room_is_rendered(monkeypatch: pytest.MonkeyPatch, tm
 
 def test_a_description_rebuilds_it(scene: Path, tmp_path: Path) -> None:
     data = module(scene, batch_size=7, cache_dir=str(tmp_path))
-    rebuilt = build(_built_extractor(data.describe()))
+    rebuilt = build_object(_built_extractor(data.describe()))
     assert rebuilt.describe() == data.describe()
     assert rebuilt.batch_size == 7
     assert rebuilt.cache.folder == data.cache.folder
 
 
 def _built_extractor(spec: dict[str, Any]) -> dict[str, Any]:
-    return {**spec, "init_args": {**spec["init_args"], "extractor": build(spec["init_args"]["extractor"])}}
+    return {**spec, "init_args": {**spec["init_args"], "extractor": build_object(spec["init_args"]["extractor"])}}
 
 
 def test_a_missing_image_is_named(scene: Path, tmp_path: Path) -> None:

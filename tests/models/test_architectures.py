@@ -10,7 +10,7 @@ import pytest
 import torch
 from lightning import Trainer
 
-from lightning_pose.checkpoint import build
+from lightning_pose.checkpoint import build_object
 from lightning_pose.data.batches import PoseBatch, batch_loader
 from lightning_pose.errors import ConfigError
 from lightning_pose.geometry.quaternions import orientation_error_deg, position_error_m
@@ -85,7 +85,7 @@ def test_a_checkpoint_rebuilds_the_same_model(architecture: Architecture) -> Non
     torch.save({"spec": model.describe(), "state_dict": model.state_dict()}, file)
     file.seek(0)
     saved: dict[str, Any] = torch.load(file, weights_only=True)  # plain types only, or this refuses
-    rebuilt: PoseModule = build(saved["spec"])
+    rebuilt: PoseModule = build_object(saved["spec"])
     rebuilt.load_state_dict(saved["state_dict"])
     assert type(rebuilt) is architecture
     assert rebuilt.learning_rate == 0.02

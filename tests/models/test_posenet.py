@@ -10,7 +10,7 @@ import torch
 from lightning import Trainer
 from torch import Tensor, nn
 
-from lightning_pose.checkpoint import build
+from lightning_pose.checkpoint import build_object
 from lightning_pose.data.batches import PoseBatch
 from lightning_pose.errors import CheckpointError, ConfigError
 from lightning_pose.features.backbones import build_backbone
@@ -93,7 +93,7 @@ def attach(model: PoseNet, problem: LearnableProblem) -> PoseNet:
 def test_a_checkpoint_needs_the_pretrained_weights_no_more(tmp_path: Path) -> None:
     gone = str(tmp_path / "gone.pth")
     model = PoseNet(input_shape=[3, 32, 32], backbone="mobilenet_v2", crop=32, weights=gone)
-    rebuilt = build(model.describe())
+    rebuilt = build_object(model.describe())
     rebuilt.load_state_dict(model.state_dict())
     images = numbered_images(2, 32, 32)
     torch.testing.assert_close(rebuilt.eval()(images), model.eval()(images))
