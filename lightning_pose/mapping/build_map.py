@@ -21,7 +21,15 @@ from lightning_pose.mapping.pairs import FEW_FRAMES, choose_pairs, estimate_dept
 from lightning_pose.mapping.point_map import PointMap, quantize_descriptors
 from lightning_pose.mapping.tracks import join_tracks
 
-__all__ = ["Tracks", "build_point_map", "find_tracks", "summarize_tracks", "triangulate_tracks"]
+__all__ = [
+    "MappedFrames",
+    "Tracks",
+    "adjust_mapped",
+    "build_point_map",
+    "map_frames",
+    "summarize_tracks",
+    "triangulate_tracks",
+]
 
 MIN_OBSERVATIONS = 5
 """Frames that must see a point. (3 doubles the map and gains nothing.)"""
@@ -64,31 +72,54 @@ class Tracks:
         return Tracks(track, self.frame[observations], self.keypoint[observations], self.points[kept])
 
 
+@dataclass(frozen=True)
+class MappedFrames:
+    """All that the building of a map knows.
+
+    Attributes:
+        given: the frames with the poses that the dataset gives.
+        seen: the same with the poses and keypoints of the map's own cameras.
+        tracks: the map's points and their observations.
+        camera: what was wrong with the assumed camera.
+    """
+
+    given: MapFrames
+    seen: MapFrames
+    tracks: Tracks
+    camera: CameraCorrection
+
+
 def build_point_map(frames: MapFrames, adjust: bool = False) -> PointMap:
-    """The map of posed frames: pairs, guided matches, depth vote, tracks, triangulation, bundle adjustment.
+    """The map of posed frames; `map_frames` says how it is made."""
+    return summarize_tracks(map_frames(frames, adjust))
+
+
+def map_frames(frames: MapFrames, adjust: bool) -> MappedFrames:
+    """Pairs, guided matches, depth vote, tracks, triangulation, bundle adjustment.
 
     Args:
         frames: with the poses that the dataset gives.
         adjust: move poses, points and camera until they agree with the images, twice: poses that are better find
             more matches. Without it, the given poses are taken as they are.
     """
-    return summarize_tracks(frames, *map_frames(frames, adjust))
-
-
-def map_frames(frames: MapFrames, adjust: bool) -> tuple[MapFrames, Tracks, CameraCorrection]:
-    """The frames as the map's own cameras saw them, the map's tracks, and what was wrong with the assumed camera."""
-    if not adjust:
-        return frames, triangulate_tracks(frames, find_tracks(frames)), CameraCorrection()
     seen, tracks = frames, triangulate_tracks(frames, find_tracks(frames))
-    state = Adjustment(frames.rotation, frames.position, tracks.points)
+    if not adjust:
+        return MappedFrames(frames, seen, tracks, CameraCorrection())
+    return adjust_mapped(MappedFrames(frames, seen, tracks, CameraCorrection()))
+
+
+def adjust_mapped(mapped: MappedFrames) -> MappedFrames:
+    """The same frames after bundle adjustment, twice, with new tracks between."""
+    given, seen, tracks = mapped.given, mapped.seen, mapped.tracks
+    state = Adjustment(given.rotation, given.position, tracks.points)
     for again in range(ADJUSTMENTS):
         if again:
             tracks = triangulate_tracks(seen, find_tracks(seen))
-        state = adjust_bundle(replace(state, points=tracks.points), frames, tracks.track, tracks.frame, tracks.keypoint)
-        points = np.where(frames.real[:, :, None], state.camera.remove(frames.points), 0.0)
-        seen = replace(frames.with_poses(*state.camera_poses), points=points)
+        state = adjust_bundle(replace(state, points=tracks.points), given, tracks.track, tracks.frame, tracks.keypoint)
+        points = np.where(given.real[:, :, None], state.camera.remove(given.points), 0.0)
+        seen = replace(given.with_poses(*state.camera_poses), points=points)
         tracks = replace(tracks, points=state.points)
-    return seen, triangulate_tracks(seen, tracks), state.camera
+    return MappedFrames(given, seen, triangulate_tracks(seen, tracks), state.camera)
 
 
 def find_tracks(frames: MapFrames) -> Tracks:
@@ -118,15 +149,9 @@ def triangulate_tracks(frames: MapFrames, tracks: Tracks) -> Tracks:
     return tracks.select(wide[tracks.track])
 
 
-def summarize_tracks(given: MapFrames, frames: MapFrames, tracks: Tracks, camera: CameraCorrection) -> PointMap:
-    """What a map keeps.
-
-    Args:
-        given: the frames with the poses that the dataset gives.
-        frames: the same with the poses of the map.
-        tracks: its points and their observations.
-        camera: what was wrong with the assumed camera.
-    """
+def summarize_tracks(mapped: MappedFrames) -> PointMap:
+    """What a map keeps of its frames and tracks."""
+    given, frames, tracks, camera = mapped.given, mapped.seen, mapped.tracks, mapped.camera
     n = len(tracks.points)
     count = np.bincount(tracks.track, minlength=n)[:, None]
     to_camera = frames.position[tracks.frame] - tracks.points[tracks.track]

@@ -1,4 +1,4 @@
-"""MapFrames: posed frames with their keypoints, the one form in which all stages of map building read them."""
+"""MapFrames: posed frames with keypoints, as all stages of map building read them; MapQuery: one image without a pose."""
 
 from __future__ import annotations
 
@@ -6,7 +6,26 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-__all__ = ["MapFrames"]
+__all__ = ["MapFrames", "MapQuery"]
+
+
+@dataclass(frozen=True)
+class MapQuery:
+    """Keypoints of one image, as `MapFrames` has them of many.
+
+    Attributes:
+        points: (N, 2) float64, normalised image coordinates.
+        size_px: (N,) float32.
+        descriptors: (N, D) float32, L2-normalised.
+        focal_px: focal length.
+        half_view: (2,), half the width and height of the image in normalised image coordinates.
+    """
+
+    points: np.ndarray
+    size_px: np.ndarray
+    descriptors: np.ndarray
+    focal_px: float
+    half_view: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -46,6 +65,17 @@ class MapFrames:
     def with_poses(self, rotation: np.ndarray, position: np.ndarray) -> MapFrames:
         """The same frames with other poses."""
         return replace(self, rotation=rotation, position=position)
+
+    def query(self, frame: int) -> MapQuery:
+        """One of the frames, without its pose."""
+        n = self.count[frame]
+        return MapQuery(
+            self.points[frame, :n],
+            self.size_px[frame, :n],
+            self.descriptors[frame, :n],
+            float(self.focal_px[frame]),
+            self.half_view[frame],
+        )
 
     @property
     def real(self) -> np.ndarray:

@@ -8,10 +8,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lightning_pose.geometry.absolute_pose import CameraPose, RefinedPose, find_pose_ransac, refine_pose
+from lightning_pose.mapping.frames import MapQuery
 from lightning_pose.mapping.point_map import PointMap
 from lightning_pose.mapping.query_matching import QueryMatcher
 
-__all__ = ["MapAnswer", "MapLocalizer", "MapQuery"]
+__all__ = ["MapAnswer", "MapLocalizer"]
 
 MIN_MATCHES = 8
 """Fewer matches are no start for RANSAC."""
@@ -26,25 +27,6 @@ ACCEPT_INLIERS = 20
 
 KERNEL = (0.05, 5.0)
 """How far training frames lend their offset to an answer: in median depths of the map's points, and degrees."""
-
-
-@dataclass(frozen=True)
-class MapQuery:
-    """Keypoints of one image, as `MapFrames` has them of many.
-
-    Attributes:
-        points: (N, 2) float64, normalised image coordinates.
-        size_px: (N,) float32.
-        descriptors: (N, D) float32, L2-normalised.
-        focal_px: focal length.
-        half_view: (2,), half the width and height of the image in normalised image coordinates.
-    """
-
-    points: np.ndarray
-    size_px: np.ndarray
-    descriptors: np.ndarray
-    focal_px: float
-    half_view: np.ndarray
 
 
 @dataclass(frozen=True)

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from lightning_pose.geometry.absolute_pose import CameraPose
+from lightning_pose.mapping.frames import MapQuery
 from lightning_pose.mapping.point_map import PointMap
-
-if TYPE_CHECKING:
-    from lightning_pose.mapping.map_localizer import MapQuery
 
 __all__ = ["QueryMatcher"]
 
