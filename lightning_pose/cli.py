@@ -13,16 +13,17 @@ from typing import Any, NoReturn
 import torch
 import yaml
 from jsonargparse import DefaultHelpFormatter, get_loader, set_loader
-from lightning import LightningDataModule, Trainer
+from lightning import Trainer
 from lightning.pytorch.callbacks import Timer
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from lightning_pose.checkpoint import read_checkpoint, resolve_class_path, resolve_class_paths
+from lightning_pose.data import SceneDataModule, require_clips
 from lightning_pose.errors import CheckpointError, ConfigError
 from lightning_pose.evaluation.callback import TestReport
 from lightning_pose.localization.sequences import chain_test
-from lightning_pose.models import ClipModule, PoseModule
+from lightning_pose.models import PoseModule
 from lightning_pose.paths import default_tracking_uri
 from lightning_pose.runs.checkpoints import BestCheckpoint, LastCheckpoint, checkpoint_folder
 from lightning_pose.runs.epoch_bar import EpochBar
@@ -151,7 +152,7 @@ class PoseCLI(LightningCLI):
         self.recorder = RunRecorder()
         super().__init__(
             model_class=PoseModule,
-            datamodule_class=LightningDataModule,
+            datamodule_class=SceneDataModule,
             subclass_mode_model=True,
             subclass_mode_data=True,
             save_config_callback=None,  # it asserts with a database logger; the recorder keeps the config
@@ -233,13 +234,14 @@ class PoseCLI(LightningCLI):
         checkpoint = str(best) if best.is_file() else None
         self.trainer.test(self.model, datamodule=self.datamodule, ckpt_path=checkpoint, verbose=False)
 
-    def predict(self, model: PoseModule, datamodule: Any, **kwargs: Any) -> None:
+    def predict(self, model: PoseModule, datamodule: SceneDataModule, **kwargs: Any) -> None:
         """Write one TUM file a sequence of the test split."""
         scene = datamodule.scene
-        if isinstance(model, ClipModule):
+        if model.reads_clips:
             datamodule.prepare_data()
             model.load_state_dict(read_checkpoint(kwargs["ckpt_path"])["state_dict"])
-            rows, *poses = (torch.cat(parts) for parts in zip(*chain_test(model, datamodule), strict=True))
+            chained = chain_test(model, require_clips(datamodule))
+            rows, *poses = (torch.cat(parts) for parts in zip(*chained, strict=True))
             numbers = datamodule.dataset("test").data.frame[rows].tolist()
         else:
             poses = map(

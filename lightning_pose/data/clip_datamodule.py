@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar, cast
 
 from torch.utils.data import DataLoader
 
@@ -18,7 +18,7 @@ from lightning_pose.scenes.combine import join_scenes
 from lightning_pose.scenes.formats import load_scene
 from lightning_pose.scenes.scene import Scene
 
-__all__ = ["ClipDataModule"]
+__all__ = ["ClipDataModule", "require_clips"]
 
 LONGEST = 400
 """Frames of the longest clip that the thesis tests."""
@@ -126,8 +126,12 @@ class ClipDataModule(SceneDataModule):
     def _load(self, roots: Sequence[str | Path]) -> list[Scene]:
         return [load_scene(root, self.format, self.val_fraction, val_block=self._shape.span) for root in roots]
 
+    def dataset(self, split: str) -> ClipDataset:
+        """One of `train`, `val`, `test` as clips, without augmentation."""
+        return cast(ClipDataset, super().dataset(split))
+
     def _make_dataset(self, split: str, data: PoseBatch) -> ClipDataset:
-        return self._clips(split, data, self._shape)
+        return self._cut_clips(split, data, self._shape)
 
     def clips(self, split: str, length: int) -> ClipDataset:
         """A split's clips of another length.
@@ -135,24 +139,40 @@ class ClipDataModule(SceneDataModule):
         Raises:
             DataError: no run of consecutive frames is that long.
         """
-        return self._clips(split, self.dataset(split).data, ClipShape(length, self.stride))
+        return self._cut_clips(split, self.dataset(split).data, ClipShape(length, self.stride))
 
     def longest_clip(self, split: str) -> int:
         """The most frames that a clip of a split can have."""
         runs = find_runs(self.scene, self.scene.splits[split])
         return max(((len(run) - 1) // self.stride + 1 for run in runs), default=0)
 
-    def _clips(self, split: str, data: PoseBatch, shape: ClipShape, **settings: Any) -> ClipDataset:
+    def _cut_clips(
+        self, split: str, data: PoseBatch, shape: ClipShape, augmentation: Augmentation | None = None
+    ) -> ClipDataset:
         runs = find_runs(self.scene, self.scene.splits[split])
-        return ClipDataset(data, runs, shape, self.relative_frame, **settings)
+        return ClipDataset(data, runs, shape, self.relative_frame, augmentation)
 
     def train_dataloader(self) -> DataLoader[PoseBatch]:
         data = self.dataset("train").data
-        clips = self._clips("train", data, self._shape, augmentation=self._augmentation())
+        clips = self._cut_clips("train", data, self._shape, self._augmentation())
         return batch_loader(clips, self.batch_size, shuffle=True)
 
     def _augmentation(self) -> Augmentation:
         return Augmentation(True, self.max_stride, self.reverse, self.extractor.mirror if self.mirror else None)
+
+
+def require_clips(datamodule: SceneDataModule) -> ClipDataModule:
+    """The same data module, as one of clips.
+
+    Raises:
+        ConfigError: it gives single images.
+    """
+    if not isinstance(datamodule, ClipDataModule):
+        raise ConfigError(
+            f"{type(datamodule).__name__} gives images, not clips; set data.class_path to "
+            "lightning_pose.data.ClipDataModule"
+        )
+    return datamodule
 
 
 def _check_named_once(root: str | None, train_scenes: list[str] | None, test_scenes: list[str] | None) -> None:

@@ -9,9 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import Dataset
 
-from lightning_pose.data.batches import PoseBatch
+from lightning_pose.data.batches import PoseBatch, PoseDataset
 from lightning_pose.errors import ConfigError, DataError
 from lightning_pose.geometry.relative import RelativeFrame, relative_poses
 from lightning_pose.scenes.scene import Scene
@@ -109,7 +108,7 @@ def mirrored_poses(position_m: Tensor, quat_wxyz: Tensor) -> tuple[Tensor, Tenso
     return position_m * position_m.new_tensor([-1.0, 1, 1]), quat_wxyz * quat_wxyz.new_tensor([1.0, 1, -1, -1])
 
 
-class ClipDataset(Dataset[PoseBatch]):
+class ClipDataset(PoseDataset):
     """Clips of one split. Indexing by a list gives the whole batch in one gather: frames are shared, not copied.
 
     A batch has features (B, T, ...), poses relative to each clip's first frame (B, T, 3) and (B, T, 4), and frames
@@ -134,7 +133,7 @@ class ClipDataset(Dataset[PoseBatch]):
         relative_frame: RelativeFrame = "camera",
         augmentation: Augmentation | None = None,
     ) -> None:
-        self.data = data
+        super().__init__(data)
         self.runs = list(runs)
         self.shape = shape
         self.relative_frame: RelativeFrame = relative_frame

@@ -64,7 +64,7 @@ def test_integrated_steps_begin_at_the_origin_and_add_up(network: type[ClipModul
     position_m, quat_wxyz = model(features)
     torch.testing.assert_close(position_m[:, 0], torch.zeros(1, 3))
     torch.testing.assert_close(quat_wxyz[:, 0], torch.eye(4)[:1])
-    steps, _ = model._unscaled(model.network(model._standardized(features).unsqueeze(2)))
+    steps, _ = model.unscale_pose(model.network(model.standardize_input(features).unsqueeze(2)))
     torch.testing.assert_close(position_m[:, 1], steps[:, 1])
 
 
@@ -72,7 +72,7 @@ def test_integrated_networks_learn_the_scale_of_steps_and_others_that_of_clips()
     problem = ClipProblem([6, 12])
     trainer = Trainer(accelerator="cpu", logger=False, enable_checkpointing=False)
     trainer.datamodule = problem  # type: ignore[attr-defined]
-    position_m, quat_wxyz = problem.clips.targets()
+    position_m, quat_wxyz = problem.training_clips.targets()
     for integrate in (False, True):
         model = make(CNNRNN, integrate=integrate)
         model.trainer = trainer
@@ -119,7 +119,7 @@ def test_motion_has_a_scale_of_its_own() -> None:
     problem = ClipProblem([6, 12])
     features = seen_points(24)[0]
     features[..., 8] -= features[..., 8].floor()  # whoever leaves to the right comes back
-    problem.clips.data.features.copy_(features)
+    problem.training_clips.data.features.copy_(features)
     model = make(CNN3D, motion=True)
     trainer = Trainer(accelerator="cpu", logger=False, enable_checkpointing=False)
     trainer.datamodule = problem  # type: ignore[attr-defined]

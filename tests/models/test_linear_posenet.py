@@ -164,5 +164,5 @@ def test_a_frame_that_a_sampler_repeats_counts_once(monkeypatch: pytest.MonkeyPa
         monkeypatch.setattr(LinearPoseNet, "trainer", type("Two", (), {"world_size": 2, "global_rank": rank})())
         model.on_train_epoch_start()
         for rows in (slice(0, 3), slice(3, 4)):
-            model._add(PoseBatch(*(tensor[rows] for tensor in data)), frames=7)
-        assert model._moments.count == own
+            model.add_frames(PoseBatch(*(tensor[rows] for tensor in data)), frames=7)
+        assert model.moments.count == own

@@ -113,7 +113,7 @@ def test_a_module_that_comes_frozen_is_trained() -> None:
 def test_mixed_precision_leaves_poses_in_single_precision() -> None:
     model = make_model(PoseNet)
     with torch.autocast("cpu", torch.bfloat16):
-        pose = model.train()._decode(torch.rand(4, 3, 12, 12))[0]
+        pose = model.train().decode_features(torch.rand(4, 3, 12, 12))[0]
     assert pose.dtype == torch.float32
     assert (pose.bfloat16().float() != pose).any()
     trainer(precision="bf16-mixed").fit(model, datamodule=LearnableProblem([3, 12, 12]))

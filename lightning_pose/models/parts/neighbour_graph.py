@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-__all__ = ["ABSENT", "edge_index", "neighbourhood", "neighbours_within", "sample_neighbours", "search_neighbours"]
+__all__ = ["ABSENT", "edge_index", "find_neighbourhood", "neighbours_within", "sample_neighbours", "search_neighbours"]
 
 ABSENT = -1
 _CHUNK_ELEMENTS = 2**22  # of the distances in memory at a time: 16 MB
@@ -78,7 +78,7 @@ def sample_neighbours(table: Tensor, count: int) -> Tensor:
     return table.gather(1, places)
 
 
-def neighbourhood(table: Tensor, seeds: Tensor, hops: int) -> tuple[Tensor, Tensor, Tensor]:
+def find_neighbourhood(table: Tensor, seeds: Tensor, hops: int) -> tuple[Tensor, Tensor, Tensor]:
     """The part of a graph on which the states of some nodes depend after as many convolutions.
 
     PyG's NeighborLoader does this with compiled packages (pyg-lib, torch-sparse) that torch-geometric does not

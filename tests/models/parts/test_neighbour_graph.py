@@ -9,7 +9,7 @@ from lightning_pose.models.parts import neighbour_graph
 from lightning_pose.models.parts.neighbour_graph import (
     ABSENT,
     edge_index,
-    neighbourhood,
+    find_neighbourhood,
     neighbours_within,
     sample_neighbours,
     search_neighbours,
@@ -77,7 +77,7 @@ def test_a_sample_holds_different_neighbours_of_the_node() -> None:
 
 def test_a_neighbourhood_is_what_its_seeds_depend_on() -> None:
     chain = torch.tensor([[1], [2], [3], [4], [ABSENT], [0]])  # 0 hears 1, which hears 2, ...; 5 hears 0
-    nodes, table, seeds = neighbourhood(chain, torch.tensor([1, 0]), hops=2)
+    nodes, table, seeds = find_neighbourhood(chain, torch.tensor([1, 0]), hops=2)
     assert nodes.tolist() == [0, 1, 2, 3]
     assert table.tolist() == [[1], [2], [3], [ABSENT]]
     assert seeds.tolist() == [1, 0]
