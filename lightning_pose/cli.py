@@ -122,15 +122,18 @@ The checkpoint knows its architecture and its data; both can be overridden.
 }
 
 
-def _help(verb: str) -> dict[str, Any]:
+PROGRAM = "python -m lightning_pose"
+
+
+def _parser_settings(verb: str) -> dict[str, str]:
     return {
-        "prog": f"python -m lightning_pose {verb}",
-        "usage": f"python -m lightning_pose {verb} --config FILE [--SETTING VALUE ...]",
+        "prog": f"{PROGRAM} {verb}",
+        "usage": f"{PROGRAM} {verb} --config FILE [--SETTING VALUE ...]",
         "description": HELP[verb],
     }
 
 
-def _quieten() -> None:
+def _quiet_lightning() -> None:
     """Drop messages of Lightning about devices, restored files and its own use of torch: no user can act on them."""
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.WARNING)
@@ -148,8 +151,10 @@ class PoseCLI(LightningCLI):
     """
 
     def __init__(self, args: list[str], run: bool = True) -> None:
-        _quieten()
+        _quiet_lightning()
         self.recorder = RunRecorder()
+        self.verb_parsers: dict[str, LightningArgumentParser] = {}
+        self._checkpoint: str | None = None
         super().__init__(
             model_class=PoseModule,
             datamodule_class=SceneDataModule,
@@ -168,12 +173,15 @@ class PoseCLI(LightningCLI):
             auto_configure_optimizers=False,
             load_from_checkpoint_support=False,  # checkpoints carry their own plain settings
             parser_class=PoseParser,
-            parser_kwargs={verb: _help(verb) for verb in self.subcommands()} if run else _help("extract"),
+            parser_kwargs={verb: _parser_settings(verb) for verb in self.subcommands()}
+            if run
+            else _parser_settings("extract"),
             args=_with_saved_config(args) if run else args,
             run=run,
         )
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
+        self.verb_parsers[str(parser.prog).removeprefix(PROGRAM).strip()] = parser
         parser.link_arguments("data.input_shape", "model.init_args.input_shape", apply_on="instantiate")
         parser.add_lightning_class_args(BestCheckpoint, "best")
         parser.add_lightning_class_args(TestReport, "report")
@@ -184,9 +192,11 @@ class PoseCLI(LightningCLI):
             self.config = parser.parse_args([_rename_value(word) for word in args])
         except UnicodeDecodeError as error:
             raise ConfigError(f"the config is not text ({error}); give a YAML file") from error
-
-    def _parse_ckpt_path(self) -> None:
-        """Nothing: `_with_saved_config` has taken the settings out of the checkpoint already."""
+        if "subcommand" in self.config:
+            # Lightning would read a checkpoint named here, and add its hyperparameters to the config.
+            # `_with_saved_config` has added them already, so the name is put aside until then.
+            config = self.config[self.config.subcommand]
+            self._checkpoint, config.ckpt_path = config.ckpt_path, None
 
     def instantiate_classes(self) -> None:
         try:
@@ -199,6 +209,8 @@ class PoseCLI(LightningCLI):
         self.model.check_data(self.datamodule)
 
     def before_instantiate_classes(self) -> None:
+        if self.subcommand is not None:
+            self.config[self.subcommand].ckpt_path = self._checkpoint
         if self.subcommand in ("validate", "predict"):
             self.config[self.subcommand].trainer.logger = False  # a look at a checkpoint is no run
         elif self.subcommand == "test":
@@ -224,8 +236,11 @@ class PoseCLI(LightningCLI):
         config.ckpt_path = str(checkpoint)
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
-        config = self.config if self.subcommand is None else self.config[self.subcommand]
-        self.recorder.config_yaml = self._parser(self.subcommand).dump(config, skip_unset=False)
+        if self.subcommand is None:
+            config, parser = self.config, self.parser
+        else:
+            config, parser = self.config[self.subcommand], self.verb_parsers[self.subcommand]
+        self.recorder.config_yaml = parser.dump(config, skip_unset=False)
         return super().instantiate_trainer(**kwargs)
 
     def after_fit(self) -> None:

@@ -58,7 +58,7 @@ class RunRecorder(Callback):
             f"seed={seed}" if seed else "",
             "" if stage == "fit" else "(test)",
         )
-        name = logger._run_name or " ".join(part for part in parts if part)
+        name = logger.run_name or " ".join(part for part in parts if part)
         return name if trial is None else f"{name} trial {trial}"
 
     @staticmethod

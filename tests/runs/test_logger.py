@@ -15,7 +15,7 @@ import pytest
 
 from lightning_pose.errors import CheckpointError
 from lightning_pose.paths import default_tracking_uri
-from lightning_pose.runs.logger import REQUIREMENTS, MLflowLogger, flatten, last_run
+from lightning_pose.runs.logger import REQUIREMENTS, MLflowLogger, flatten_settings, last_run
 from lightning_pose.runs.process import has_died, machine, process_name
 from tests.helpers import Trained, Workplace
 
@@ -59,7 +59,7 @@ def test_a_store_named_in_code_is_not_the_next_logger_s(tmp_path: Path, store: P
 
 def test_settings_by_dotted_name() -> None:
     spec = {"class_path": "a.Net", "init_args": {"units": 8, "loss": {"form": "joint"}}}
-    assert flatten({"model": spec, "seed": 0}) == {
+    assert flatten_settings({"model": spec, "seed": 0}) == {
         "model.class_path": "a.Net",
         "model.units": 8,
         "model.loss.form": "joint",
