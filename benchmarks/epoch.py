@@ -20,7 +20,7 @@ from lightning.pytorch.callbacks import Timer
 
 from lightning_pose import models
 from lightning_pose.data import SceneDataModule
-from lightning_pose.data.batches import PoseBatch, PoseDataset, batch_loader
+from lightning_pose.data.batches import PoseBatch, PoseDataset, make_loader
 from lightning_pose.features import SURF
 from lightning_pose.geometry.quaternions import align_hemisphere, quat_normalize
 from lightning_pose.runs.checkpoints import BestCheckpoint, LastCheckpoint
@@ -54,7 +54,7 @@ class RandomData(SceneDataModule):
         return self.train
 
     def train_dataloader(self):
-        return batch_loader(self.train, self.batch_size, shuffle=True)
+        return make_loader(self.train, self.batch_size, shuffle=True)
 
     def val_dataloader(self):
         return []

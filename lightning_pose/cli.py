@@ -22,12 +22,12 @@ from lightning_pose.checkpoint import read_checkpoint, resolve_class_path, resol
 from lightning_pose.data import SceneDataModule, require_clips
 from lightning_pose.errors import CheckpointError, ConfigError
 from lightning_pose.evaluation.callback import TestReport
-from lightning_pose.localization.sequences import chain_test
+from lightning_pose.localization.sequences import chain_test_split
 from lightning_pose.models import PoseModule
 from lightning_pose.paths import default_tracking_uri
 from lightning_pose.runs.checkpoints import BestCheckpoint, LastCheckpoint, checkpoint_folder
 from lightning_pose.runs.epoch_bar import EpochBar
-from lightning_pose.runs.logger import last_run
+from lightning_pose.runs.logger import find_last_run
 from lightning_pose.runs.recorder import RunRecorder
 from lightning_pose.scenes.trajectory_files import write_sequences
 
@@ -56,9 +56,9 @@ def _rename_value(word: str) -> str:
 
 
 class PoseParser(LightningArgumentParser):
-    """A parser that reads older class paths by today's, and raises ConfigError for a wrong setting.
+    """A parser that replaces older class paths by today's, and raises ConfigError for a wrong setting.
 
-    The error ends in one line like any other mistake of a user.
+    So a wrong setting ends in one line, as every mistake of a user does.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -81,7 +81,7 @@ NOISE = re.compile(
 
 
 def _one_line(message: str) -> str:
-    """jsonargparse's many lines without what it says of its own types: which setting, and what is wrong with it."""
+    """jsonargparse's message in one line, without its notes on types: which setting, and what is wrong with it."""
     lines = [NOISE.sub("", line).strip(" -") for line in message.splitlines()]
     text = " ".join(line for line in lines if line)
     text = re.sub(r"<class '([^']+)'>", r"\1", re.sub(r'Parser key "([^"]+)":', r"\1:", text))
@@ -225,7 +225,7 @@ class PoseCLI(LightningCLI):
         logger = config.trainer.logger
         if not logger:
             raise ConfigError("trainer.logger is off, so no run is known; name the checkpoint in --ckpt_path")
-        run_id, checkpoint = last_run(
+        run_id, checkpoint = find_last_run(
             uri=logger.init_args.tracking_uri or default_tracking_uri(logger.init_args.root),
             experiment_name=logger.init_args.experiment_name,
             checkpoints=Path(config.trainer.default_root_dir) / "checkpoints",
@@ -255,7 +255,7 @@ class PoseCLI(LightningCLI):
         if model.reads_clips:
             datamodule.prepare_data()
             model.load_state_dict(read_checkpoint(kwargs["ckpt_path"])["state_dict"])
-            chained = chain_test(model, require_clips(datamodule))
+            chained = chain_test_split(model, require_clips(datamodule))
             rows, *poses = (torch.cat(parts) for parts in zip(*chained, strict=True))
             numbers = datamodule.dataset("test").data.frame[rows].tolist()
         else:
@@ -278,8 +278,8 @@ class _OptionParser(argparse.ArgumentParser):
 def _with_saved_config(args: list[str]) -> list[str]:
     """Put the checkpoint's own settings into the command line of a verb that only reads it.
 
-    Its architecture replaces the config's, which may have other widths; its data settings serve where no config is
-    given. Options on the command line still win.
+    Its architecture replaces the config's, which may have other widths. Its data settings are used if no config is
+    given. Options on the command line have precedence.
     """
     parser = _OptionParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--ckpt_path")

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-__all__ = ["DrawnDataset", "PoseBatch", "PoseDataset", "batch_loader"]
+__all__ = ["DrawnDataset", "PoseBatch", "PoseDataset", "make_loader"]
 
 
 class PoseBatch(NamedTuple):
@@ -79,6 +79,6 @@ def _keep_batch(batch: Any) -> PoseBatch:
     return batch
 
 
-def batch_loader(dataset: Dataset[PoseBatch], batch_size: int, shuffle: bool) -> DataLoader[PoseBatch]:
+def make_loader(dataset: Dataset[PoseBatch], batch_size: int, shuffle: bool) -> DataLoader[PoseBatch]:
     """A DataLoader whose batches come from `__getitems__`; Lightning can still shard it over processes."""
     return DataLoader(dataset, batch_size=batch_size, shuffle=shuffle, collate_fn=_keep_batch)

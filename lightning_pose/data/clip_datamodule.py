@@ -8,7 +8,7 @@ from typing import ClassVar, cast
 
 from torch.utils.data import DataLoader
 
-from lightning_pose.data.batches import PoseBatch, batch_loader
+from lightning_pose.data.batches import PoseBatch, make_loader
 from lightning_pose.data.clip_dataset import Augmentation, ClipDataset, ClipShape, find_runs
 from lightning_pose.data.datamodule import SceneDataModule, room_folder
 from lightning_pose.errors import ConfigError
@@ -27,9 +27,9 @@ LONGEST = 400
 class ClipDataModule(SceneDataModule):
     """Clips of T consecutive frames of one sequence, with poses relative to each clip's first frame (eq. 6.1).
 
-    Scenes to train and to test on are named apart, so that a network can be tested where it has never been: a scene
-    that is only tested on gives its official test split, or all of its frames if it has none. With nothing named,
-    it trains on synthetic rooms and tests on another.
+    Scenes to train and to test on are given separately, so that a network can be tested on scenes that it was not
+    trained on. A scene that is only for testing gives its official test split, or all of its frames if it has none.
+    Without scenes, training is on synthetic rooms and the test on another.
 
     Args:
         extractor: what the networks read of each frame, such as `lightning_pose.features.SURF`.
@@ -42,7 +42,7 @@ class ClipDataModule(SceneDataModule):
         hop: from the first frame of a clip to that of the next; by default clips share one frame, so that they chain.
             In training clips begin up to a hop later, at random.
         relative_frame: axes of relative positions: `camera`, the first camera's, or `world`, as eq. 6.1 has them,
-            which no network can know in a scene that it has not seen.
+            which no network can infer in a scene that it was not trained on.
         max_stride: in training, take every k-th frame, k drawn up to this, so that the camera moves faster than it did;
             1 or `stride` for none.
         reverse: in training, play half of the clips backwards.
@@ -155,7 +155,7 @@ class ClipDataModule(SceneDataModule):
     def train_dataloader(self) -> DataLoader[PoseBatch]:
         data = self.dataset("train").data
         clips = self._cut_clips("train", data, self._shape, self._augmentation())
-        return batch_loader(clips, self.batch_size, shuffle=True)
+        return make_loader(clips, self.batch_size, shuffle=True)
 
     def _augmentation(self) -> Augmentation:
         return Augmentation(True, self.max_stride, self.reverse, self.extractor.mirror if self.mirror else None)

@@ -12,7 +12,7 @@ from lightning import LightningDataModule, Trainer
 from torch.utils.data import DataLoader
 
 from lightning_pose.checkpoint import Spec, describe
-from lightning_pose.data.batches import PoseBatch, PoseDataset, batch_loader
+from lightning_pose.data.batches import PoseBatch, PoseDataset, make_loader
 from lightning_pose.errors import ConfigError, DataError
 from lightning_pose.features import FeatureCache, FeatureExtractor
 from lightning_pose.features.cache import FillReport
@@ -130,7 +130,7 @@ class SceneDataModule(LightningDataModule):
     predict_dataloader = test_dataloader
 
     def _eval_loader(self, split: str) -> DataLoader[PoseBatch]:
-        return batch_loader(self.dataset(split), self.eval_batch_size, shuffle=False)
+        return make_loader(self.dataset(split), self.eval_batch_size, shuffle=False)
 
     def describe(self) -> Spec:
         """Plain settings that rebuild this data module; checkpoints carry them."""

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from torch.utils.data import DataLoader
 
-from lightning_pose.data.batches import DrawnDataset, PoseBatch, batch_loader
+from lightning_pose.data.batches import DrawnDataset, PoseBatch, make_loader
 from lightning_pose.data.datamodule import SceneDataModule, room_folder
 from lightning_pose.errors import ConfigError
 from lightning_pose.features import FeatureCache, FeatureExtractor, LocalExtractor
@@ -72,7 +72,7 @@ class ImageDataModule(SceneDataModule):
         if self._pool is not None:
             pool = self._read("train", FeatureCache(self._pool, self.cache_dir))
             train = DrawnDataset(pool, self.input_shape[0])
-        return batch_loader(train, self.batch_size, shuffle=True)
+        return make_loader(train, self.batch_size, shuffle=True)
 
 
 def _widen_extractor(extractor: FeatureExtractor, times: float) -> LocalExtractor:

@@ -13,15 +13,15 @@ from torch import Tensor
 from lightning_pose.data.clip_datamodule import ClipDataModule, require_clips
 from lightning_pose.data.clip_dataset import ClipDataset
 from lightning_pose.data.datamodule import scene_datamodule
-from lightning_pose.evaluation.baselines.clips import constant_velocity, no_motion
-from lightning_pose.evaluation.baselines.visual_odometry import visual_odometry
+from lightning_pose.evaluation.baselines.clips import predict_constant_velocity, predict_no_motion
+from lightning_pose.evaluation.baselines.visual_odometry import run_visual_odometry
 from lightning_pose.evaluation.costs import costs
-from lightning_pose.evaluation.responses import layer_responses
+from lightning_pose.evaluation.responses import record_responses
 from lightning_pose.evaluation.result import Evaluation, skill
 from lightning_pose.figures import clips as clip_figures
 from lightning_pose.geometry.quaternions import orientation_error_deg, position_error_m, quat_rotate
 from lightning_pose.geometry.relative import absolute_poses, relative_poses
-from lightning_pose.localization.sequences import chain_test
+from lightning_pose.localization.sequences import chain_test_split
 from lightning_pose.metrics.summary import summarize_errors
 from lightning_pose.metrics.trajectory import drift_by_length, mean_over_sequences, trajectory_errors
 from lightning_pose.models.base import Pose, PoseModule
@@ -102,12 +102,12 @@ def _chain_sequences(datamodule: ClipDataModule, module: PoseModule, odometry: b
     """Chain clips over every run of test frames that holds two."""
     scene, data = datamodule.scene, datamodule.dataset("test").data
     found = []
-    for rows, *chained in chain_test(module, datamodule):
+    for rows, *chained in chain_test_split(module, datamodule):
         frames = [scene.frames[i] for i in data.frame[rows].tolist()]
         truth = Pose(data.position_m[rows].double(), data.quat_wxyz[rows].double())
         systems, failed = {type(module).__name__: Pose(*chained)}, 0
         if odometry:
-            motion = visual_odometry(frames, torch.arange(len(frames))[None])
+            motion = run_visual_odometry(frames, torch.arange(len(frames))[None])
             failed = motion.failed_steps
             start = truth.position_m[0], truth.quat_wxyz[0]
             systems["visual_odometry"] = Pose(*absolute_poses(motion.position_m[0], motion.quat_wxyz[0], *start))
@@ -124,10 +124,10 @@ def _evaluate_length(
     truth = Pose(*(part.double() for part in clips.targets()))
     count = len(clips)
     position_m, quat_wxyz = datamodule.dataset("train").targets()
-    velocity = constant_velocity(position_m, quat_wxyz, length, datamodule.relative_frame)
+    velocity = predict_constant_velocity(position_m, quat_wxyz, length, datamodule.relative_frame)
     answers = {
         type(module).__name__: _predict_clips(module, clips),
-        "no_motion": Pose(*no_motion(count, length)),
+        "no_motion": Pose(*predict_no_motion(count, length)),
         "constant_velocity": Pose(velocity[0].expand(count, -1, 3), velocity[1].expand(count, -1, 4)),
     }
     if "visual_odometry" in sequences[0].systems:
@@ -200,13 +200,13 @@ def _draw_clip_figures(
         for system in found[lengths[0]]
     }
     return {
-        "trajectory": clip_figures.relative_trajectories(
+        "trajectory": clip_figures.draw_relative_trajectories(
             {title: s.truth.position_m.numpy() for title, s in shown.items()},
             {title: s.systems[name].position_m.numpy() for title, s in shown.items()},
             title=f"{name} on {scene.name}, chained from the start",
             unit=scene.unit,
         ),
-        "error_by_length": clip_figures.error_by_length(
+        "error_by_length": clip_figures.draw_error_by_length(
             lengths, errors, title=f"{name} on {scene.name}", unit=scene.unit
         ),
     }
@@ -225,9 +225,9 @@ def _draw_responses(datamodule: ClipDataModule, module: PoseModule) -> Figure:
     """Responses of the first two layers to the middle frame of the first test clip."""
     clip = datamodule.dataset("test")[0].features
     middle = len(clip) // 2
-    layers = {name: list(out[middle].numpy()) for name, out in layer_responses(module, clip).items()}
+    layers = {name: list(out[middle].numpy()) for name, out in record_responses(module, clip).items()}
     images = [image.permute(1, 2, 0).numpy() for image in clip]
-    return clip_figures.responses(images, layers, title=f"What {type(module).__name__} responds to")
+    return clip_figures.draw_responses(images, layers, title=f"What {type(module).__name__} responds to")
 
 
 def _join_trajectories(sequences: list[Sequence], name: str) -> dict[str, tuple[list[Frame], Pose]]:

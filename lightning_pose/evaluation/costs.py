@@ -13,7 +13,7 @@ from torch import nn
 from lightning_pose.data.datamodule import SceneDataModule, scene_datamodule
 from lightning_pose.models.base import PoseModule
 from lightning_pose.runs.checkpoints import checkpoint_folder
-from lightning_pose.runs.recorder import train_seconds
+from lightning_pose.runs.recorder import read_train_seconds
 
 __all__ = ["costs", "count_layers"]
 
@@ -48,7 +48,7 @@ def costs(
     best = checkpoint_folder(trainer) / "best.ckpt"
     if best.is_file():
         found["cost/checkpoint_bytes"] = float(best.stat().st_size)
-    seconds = train_seconds(trainer)
+    seconds = read_train_seconds(trainer)
     return found | ({"cost/train_seconds": seconds} if seconds else {})
 
 

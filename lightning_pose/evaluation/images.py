@@ -78,7 +78,7 @@ def _draw_image_figures(
     model = errors.pop(name)
     about = f"{name} on {scene.name}"
     return {
-        "trajectory": image_figures.trajectory(
+        "trajectory": image_figures.draw_trajectory(
             test.position_m.numpy(),
             poses[name].position_m.numpy(),
             [frame.sequence for frame in frames],
@@ -86,8 +86,8 @@ def _draw_image_figures(
             title=about,
             unit=scene.unit,
         ),
-        "cumulative_errors": image_figures.cumulative_errors(model, errors, name, title=about, unit=scene.unit),
-        "error_vs_distance": image_figures.error_vs_distance(
+        "cumulative_errors": image_figures.draw_cumulative_errors(model, errors, name, title=about, unit=scene.unit),
+        "error_vs_distance": image_figures.draw_error_vs_distance(
             model[0], errors["oracle"][0], title=about, unit=scene.unit
         ),
     }

@@ -7,11 +7,11 @@ from torch import Tensor, nn
 
 from lightning_pose.models.base import PoseModule
 
-__all__ = ["layer_responses"]
+__all__ = ["record_responses"]
 
 
 @torch.no_grad()
-def layer_responses(model: PoseModule, clip: Tensor, layers: int = 2) -> dict[str, Tensor]:
+def record_responses(model: PoseModule, clip: Tensor, layers: int = 2) -> dict[str, Tensor]:
     """Outputs of a network's first convolutions and activations for one clip (thesis, fig. 6.5).
 
     Args:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from lightning_pose.data import ClipDataModule
     from lightning_pose.models.base import PoseModule
 
-__all__ = ["Chained", "chain_test", "cut_windows", "locate_sequence"]
+__all__ = ["Chained", "chain_test_split", "cut_windows", "locate_sequence"]
 
 
 def cut_windows(frames: int, length: int) -> list[range]:
@@ -65,7 +65,7 @@ class Chained(NamedTuple):
     quat_wxyz: Tensor
 
 
-def chain_test(model: PoseModule, datamodule: ClipDataModule) -> list[Chained]:
+def chain_test_split(model: PoseModule, datamodule: ClipDataModule) -> list[Chained]:
     """Locate the test split's runs of two frames or more, each from the true pose of its first frame."""
     data, model = datamodule.dataset("test").data, model.eval()
     found = []

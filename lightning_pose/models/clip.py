@@ -14,7 +14,7 @@ from lightning_pose.errors import ConfigError
 from lightning_pose.geometry.quaternions import quat_normalize, relative_pose
 from lightning_pose.geometry.relative import chain_steps
 from lightning_pose.models.base import Pose, PoseModule
-from lightning_pose.models.parts.motion import GEOMETRY_COLUMNS, MOTION_COLUMNS, matched_motion
+from lightning_pose.models.parts.motion import GEOMETRY_COLUMNS, MOTION_COLUMNS, measure_motion
 
 __all__ = ["ClipModule"]
 
@@ -30,7 +30,7 @@ class ClipModule(PoseModule):
         integrate: let the network predict each frame's pose relative to the frame before it, and compose them. The
             thesis's networks predict the pose relative to the first frame at once, which a frame and its neighbours
             in time do not show. For `data.relative_frame: camera`.
-        motion: let the network read how features moved since the frame before (`matched_motion`) instead of their
+        motion: let the network read how features moved since the frame before (`measure_motion`) instead of their
             descriptors. The descriptors of a new scene hold no information on motion, and their order even less.
             For descriptors `with_geometry`.
         **kwargs: what `PoseModule` takes.
@@ -89,7 +89,7 @@ class ClipModule(PoseModule):
     def fit_motion_scale(self, train: PoseDataset) -> None:
         """Learn how far features move, from 64 training clips at most."""
         chosen = range(0, len(train), -(-len(train) // 64))
-        rows = matched_motion(train.__getitems__(chosen).features).flatten(0, 2)
+        rows = measure_motion(train.__getitems__(chosen).features).flatten(0, 2)
         rows = rows[rows.any(1)]
         if len(rows) > 1:
             self.motion_scale.copy_(rows.square().mean(0).sqrt().clamp(min=1e-6))
@@ -106,7 +106,7 @@ class ClipModule(PoseModule):
 
     def decode_features(self, features: Tensor) -> tuple[Tensor, Tensor]:
         if self.motion:
-            read = (matched_motion(features) / self.motion_scale).transpose(2, 3)
+            read = (measure_motion(features) / self.motion_scale).transpose(2, 3)
         else:
             read = self.standardize_input(features)
         images = read.reshape(*features.shape[:2], *self.image_shape)

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from lightning_pose.errors import ConfigError
 from lightning_pose.models.base import PoseModule
 from lightning_pose.models.parts.graph_conv import GraphConvolution, PoseHeads
-from lightning_pose.models.parts.neighbour_graph import edge_index, neighbours_within
+from lightning_pose.models.parts.neighbour_graph import list_edges, search_within_graph
 
 __all__ = ["GraphPose"]
 
@@ -94,7 +94,7 @@ class _CellNetwork(nn.Module):
         """(B, C, h, w) -> (B, 7)."""
         B, _, h, w = maps.shape
         nodes = maps.flatten(2).transpose(1, 2)
-        edges = edge_index(neighbours_within(nodes, self.neighbours))
+        edges = list_edges(search_within_graph(nodes, self.neighbours))
         if self.places:
             grid = torch.cartesian_prod(
                 torch.linspace(-1, 1, h, device=maps.device), torch.linspace(-1, 1, w, device=maps.device)

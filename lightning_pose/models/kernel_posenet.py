@@ -23,9 +23,9 @@ class KernelPoseNet(TrainingMemory, ClosedFormModule):
     The kernel between two images is exp(-gamma d^2 / m): d is the distance between their features, m the median of
     d^2 between landmarks. With all training frames as landmarks, validation frames included where `refit` learns
     from them, this is kernel ridge regression itself; with fewer its Nystroem approximation (Williams & Seeger, NIPS
-    2000), in one streaming pass like LinearPoseNet's. The checkpoint carries the landmarks' features.
+    2000), in one streaming pass as for LinearPoseNet. The checkpoint carries the landmarks' features.
 
-    Not in the thesis: its nearest relative is LinearPoseNet, which this becomes as gamma goes to 0.
+    It is not in the thesis. As gamma goes to 0 it becomes the thesis's LinearPoseNet.
 
     Args:
         lambdas: ridge strengths to choose from; 1 is as strong as one frame.

@@ -17,8 +17,8 @@ from lightning_pose.models.base import PoseModule
 from lightning_pose.models.parts.graph_conv import GraphConvolution, PoseHeads
 from lightning_pose.models.parts.memory import TrainingMemory
 from lightning_pose.models.parts.neighbour_graph import (
-    edge_index,
     find_neighbourhood,
+    list_edges,
     sample_neighbours,
     search_neighbours,
 )
@@ -236,7 +236,7 @@ class _NodeNetwork(nn.Module):
 
     def convolve(self, layer: int, target: Tensor, source: Tensor, table: Tensor) -> Tensor:
         """(B, C) states of targets after a convolution over the (M, C) sources that `table` (B, K) joins them to."""
-        source_row, target_row = edge_index(table)
+        source_row, target_row = list_edges(table)
         used, source_row = source_row.unique(return_inverse=True)
         target, source = self.dropout(target), self.dropout(source[used])
         return self.convolutions[layer](target, source, torch.stack([source_row, target_row])).relu()
@@ -244,6 +244,6 @@ class _NodeNetwork(nn.Module):
 
 def _average_neighbours(rows: Tensor, table: Tensor) -> Tensor:
     """(B, 7) mean of the rows of (M, 7) that `table` (B, K) joins each target to; zero where there are none."""
-    source, target = edge_index(table)
+    source, target = list_edges(table)
     count = target.bincount(minlength=len(table)).clamp(min=1).unsqueeze(1)
     return rows.new_zeros(len(table), 7).index_add(0, target, rows[source]) / count

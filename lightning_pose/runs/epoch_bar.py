@@ -1,4 +1,4 @@
-"""The bar that training shows: one line, epochs done and to go, with the latest losses and validation errors.
+"""EpochBar: a progress bar over the epochs of training, with the latest losses and validation errors.
 
 Epochs here take a second or less, so that a bar over their batches would only flicker.
 """
@@ -19,7 +19,7 @@ SHOWN = {"train/loss": "loss", "val/position_median_m": "val m", "val/orientatio
 
 
 class EpochBar(ProgressBar):
-    """A bar over epochs, on the terminal's stderr; where there is no terminal, one line every tenth of the run."""
+    """A bar over epochs on a terminal's stderr; without a terminal, one line after each tenth of the run."""
 
     def __init__(self) -> None:
         super().__init__()

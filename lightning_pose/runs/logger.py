@@ -24,7 +24,7 @@ from lightning_pose.runs.tags import PARENT_TAG
 if TYPE_CHECKING:
     from mlflow import MlflowClient
 
-__all__ = ["MLflowLogger", "flatten_settings", "last_run", "log_localizer"]
+__all__ = ["MLflowLogger", "find_last_run", "flatten_settings", "log_localizer"]
 
 REQUIREMENTS = (
     "torch",
@@ -186,7 +186,7 @@ def flatten_settings(config: Mapping[str, Any], prefix: str = "") -> dict[str, A
     return flat
 
 
-def last_run(
+def find_last_run(
     uri: str, experiment_name: str, checkpoints: Path, architecture: str, data: Mapping[str, Any]
 ) -> tuple[str, Path]:
     """Find the newest run of an architecture on a scene that left a `last.ckpt`.

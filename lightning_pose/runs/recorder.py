@@ -18,7 +18,7 @@ from lightning_pose.runs.checkpoints import checkpoint_folder, run_logger
 from lightning_pose.runs.logger import MLflowLogger
 from lightning_pose.scenes.images import read_gray
 
-__all__ = ["RunRecorder", "train_seconds"]
+__all__ = ["RunRecorder", "read_train_seconds"]
 
 
 class RunRecorder(Callback):
@@ -92,7 +92,7 @@ class RunRecorder(Callback):
                 logger.client.log_artifact(str(logger.run_id), str(file), "checkpoints")
 
 
-def train_seconds(trainer: Trainer) -> float | None:
+def read_train_seconds(trainer: Trainer) -> float | None:
     """Seconds spent in training, resumed parts included; None where nothing was trained."""
     timers = [callback for callback in trainer.callbacks if isinstance(callback, Timer)]  # type: ignore[attr-defined]
     return (timers[0].time_elapsed("train") or None) if timers else None

@@ -11,7 +11,7 @@ from torch.utils.data import DataLoader
 
 from lightning_pose import models
 from lightning_pose.data import ClipDataModule, SceneDataModule
-from lightning_pose.data.batches import PoseBatch, PoseDataset, batch_loader
+from lightning_pose.data.batches import PoseBatch, PoseDataset, make_loader
 from lightning_pose.data.clip_dataset import ClipDataset, ClipShape
 from lightning_pose.models import PoseModule
 from tests.helpers import Thumbnails
@@ -116,7 +116,7 @@ class LearnableProblem(SceneDataModule):
         return self.splits[split]
 
     def train_dataloader(self) -> DataLoader[PoseBatch]:
-        return batch_loader(self.data, batch_size=8, shuffle=True)
+        return make_loader(self.data, batch_size=8, shuffle=True)
 
     def val_dataloader(self) -> DataLoader[PoseBatch] | list[DataLoader[PoseBatch]]:
         """None, unless a subclass has one: most tests need no validation."""
@@ -147,4 +147,4 @@ class ClipProblem(LearnableProblem, ClipDataModule):
         return self.clip_splits[split]
 
     def train_dataloader(self) -> DataLoader[PoseBatch]:
-        return batch_loader(PoseDataset(self.learnt), batch_size=8, shuffle=True)
+        return make_loader(PoseDataset(self.learnt), batch_size=8, shuffle=True)

@@ -10,10 +10,10 @@ from lightning import Trainer
 from torch import Tensor
 
 from lightning_pose.errors import ConfigError
-from lightning_pose.evaluation.responses import layer_responses
+from lightning_pose.evaluation.responses import record_responses
 from lightning_pose.geometry.relative import relative_poses
 from lightning_pose.models import CNN3D, CNNRNN, ClipModule
-from lightning_pose.models.parts.motion import matched_motion
+from lightning_pose.models.parts.motion import measure_motion
 from tests.models.helpers import ClipProblem, features_for
 
 NETWORKS: list[type[ClipModule]] = [CNNRNN, CNN3D]
@@ -91,7 +91,7 @@ def test_metrics_leave_out_the_first_frame(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_motion_is_that_of_each_point() -> None:
-    rows = matched_motion(seen_points())
+    rows = measure_motion(seen_points())
     assert rows.shape == (1, 3, 6, 5)
     assert not rows[:, 0].any(), "the first frame has none before it"
     torch.testing.assert_close(rows[0, 1:, :, 2], torch.full((2, 6), 0.1))
@@ -103,7 +103,7 @@ def test_motion_is_that_of_each_point() -> None:
 def test_motion_does_not_depend_on_the_order_of_features() -> None:
     features = seen_points()
     mixed = torch.stack([frame[torch.randperm(6)] for frame in features[0]])[None]
-    torch.testing.assert_close(matched_motion(mixed), matched_motion(features))
+    torch.testing.assert_close(measure_motion(mixed), measure_motion(features))
 
 
 def test_features_without_a_match_do_not_move() -> None:
@@ -111,7 +111,7 @@ def test_features_without_a_match_do_not_move() -> None:
     features[0, 1, 2, :8] = torch.eye(8)[7]  # another point than any before
     features[0, 1, 3, :8] = 0  # a frame with fewer features
     features[0, 1, 4, 8] = 2.0  # a jump across the image is no motion
-    rows = matched_motion(features)
+    rows = measure_motion(features)
     assert (rows[0, 1].any(-1)).tolist() == [True] * 3 + [False] * 3
 
 
@@ -163,7 +163,7 @@ def test_others_hear_later_frames(network: type[ClipModule]) -> None:
 @every_network
 def test_responses_of_the_first_two_layers(network: type[ClipModule]) -> None:
     model = make(network, [3, 32, 40]).train()
-    found = layer_responses(model, torch.rand(4, 3, 32, 40))
+    found = record_responses(model, torch.rand(4, 3, 32, 40))
     assert list(found) == ["convolution 1", "activation 1", "convolution 2", "activation 2"]
     assert found["convolution 1"].shape == found["activation 1"].shape == (4, 8, 32, 40)
     torch.testing.assert_close(found["activation 2"], found["convolution 2"].relu())

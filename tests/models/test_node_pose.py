@@ -17,7 +17,7 @@ from lightning_pose.data.batches import PoseBatch
 from lightning_pose.errors import CheckpointError, ConfigError
 from lightning_pose.geometry.quaternions import align_hemisphere, orientation_error_deg
 from lightning_pose.models import NodePose
-from lightning_pose.models.parts.neighbour_graph import edge_index, search_neighbours
+from lightning_pose.models.parts.neighbour_graph import list_edges, search_neighbours
 from tests.models.helpers import LearnableProblem, random_poses
 
 WIDTH = 16
@@ -75,7 +75,7 @@ def test_it_equals_pyg_on_the_joint_graph_of_training_images_and_queries(conv: s
             search_neighbours(*(torch.nn.functional.normalize(x, dim=1) for x in (queries, model.memory_features)), 3),
         ]
     )
-    state, edges = (nodes - model.feature_mean) / model.feature_scale, edge_index(table)
+    state, edges = (nodes - model.feature_mean) / model.feature_scale, list_edges(table)
     for convolution in model.network.convolutions:
         plain = layer(*(12, 8) if state.shape[1] == 12 else (state.shape[1], convolution.layer.out_channels))
         plain.load_state_dict(convolution.layer.state_dict())

@@ -15,7 +15,7 @@ import pytest
 
 from lightning_pose.errors import CheckpointError
 from lightning_pose.paths import default_tracking_uri
-from lightning_pose.runs.logger import REQUIREMENTS, MLflowLogger, flatten_settings, last_run
+from lightning_pose.runs.logger import REQUIREMENTS, MLflowLogger, find_last_run, flatten_settings
 from lightning_pose.runs.process import has_died, machine, process_name
 from tests.helpers import Trained, Workplace
 
@@ -159,7 +159,7 @@ def test_parameters_of_a_run_that_goes_on_may_differ(logger: MLflowLogger) -> No
 def test_the_last_run_is_the_newest_of_that_architecture_and_scene(trained: Trained) -> None:
     def find(architecture: str, root: str) -> tuple[str, Path]:
         checkpoints = trained.workplace.folder / "mlruns" / "checkpoints"
-        return last_run(trained.workplace.uri, "lightning_pose", checkpoints, architecture, {"root": root})
+        return find_last_run(trained.workplace.uri, "lightning_pose", checkpoints, architecture, {"root": root})
 
     root = str(trained.workplace.scene)
     assert find("SurfLSTM", root) == (trained.run.info.run_id, trained.last)
@@ -171,7 +171,7 @@ def test_the_last_run_is_the_newest_of_that_architecture_and_scene(trained: Trai
 
 def test_no_experiment_has_no_last_run(workplace: Workplace) -> None:
     with pytest.raises(CheckpointError, match="no run of SurfLSTM"):
-        last_run(workplace.uri, "lightning_pose", workplace.folder, "SurfLSTM", {"root": None})
+        find_last_run(workplace.uri, "lightning_pose", workplace.folder, "SurfLSTM", {"root": None})
 
 
 def test_a_logged_model_names_all_that_it_imports() -> None:

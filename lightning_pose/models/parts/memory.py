@@ -13,8 +13,8 @@ __all__ = ["TrainingMemory"]
 class TrainingMemory(LightningModule):
     """Mixin for tensors whose length depends on the training split, such as the features of each training frame.
 
-    Name it before `PoseModule` among the base classes. A new module does not know the length: the tensors begin with
-    length 0, and take over that of the checkpoint whenever weights are loaded. Other differences in shape are left
+    Name it before `PoseModule` among the base classes. In a new module the tensors have length 0; whenever weights
+    are loaded, they get the checkpoint's length. Other differences in shape are left
     for the loading to refuse.
 
     Attributes:
