@@ -12,7 +12,7 @@ from typing import Any, NoReturn
 
 import torch
 import yaml
-from jsonargparse import DefaultHelpFormatter, get_loader, set_loader
+from jsonargparse import DefaultHelpFormatter, Namespace, get_loader, set_loader
 from lightning import Trainer
 from lightning.pytorch.callbacks import Timer
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
@@ -41,7 +41,7 @@ class _HelpFormatter(argparse.RawDescriptionHelpFormatter, DefaultHelpFormatter)
 PARSER_MODE = "yaml_with_renames"
 
 
-def load_with_renames(text: str) -> Any:
+def load_with_renames(text: str) -> object:
     """A YAML value in which classes have today's paths: a config's whole content, or one value of a command line."""
     return resolve_class_paths(get_loader("yaml")(text))
 
@@ -186,7 +186,7 @@ class PoseCLI(LightningCLI):
         parser.add_lightning_class_args(BestCheckpoint, "best")
         parser.add_lightning_class_args(TestReport, "report")
 
-    def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
+    def parse_arguments(self, parser: LightningArgumentParser, args: list[str]) -> None:
         try:
             # Not Lightning's own, which warns that sys.argv is given as well.
             self.config = parser.parse_args([_rename_value(word) for word in args])
@@ -318,7 +318,7 @@ def _check_architecture(checkpoint: str, saved: str, asked: str | None) -> None:
         )
 
 
-def _check_resumable(checkpoint: str, config: Any) -> None:
+def _check_resumable(checkpoint: str, config: Namespace) -> None:
     """Refuse a checkpoint that training cannot go on from, before a run is opened for it."""
     saved = read_checkpoint(checkpoint)
     _check_architecture(checkpoint, saved["lightning_pose"]["model"]["class_path"], config.model.class_path)

@@ -6,12 +6,19 @@ Epochs here take a second or less, so that a bar over their batches would only f
 from __future__ import annotations
 
 import sys
-from typing import Any
 
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import ProgressBar
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 __all__ = ["EpochBar"]
 
@@ -24,7 +31,7 @@ class EpochBar(ProgressBar):
     def __init__(self) -> None:
         super().__init__()
         self._bar: Progress | None = None
-        self._task: Any = None
+        self._task = TaskID(0)
         self._on = True
 
     def disable(self) -> None:

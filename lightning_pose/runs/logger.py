@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from lightning.fabric.utilities.rank_zero import rank_zero_only
 from lightning.pytorch.loggers import MLFlowLogger
@@ -123,7 +123,7 @@ class MLflowLogger(MLFlowLogger):
             client.set_terminated(run_id, "KILLED")
 
     @rank_zero_only
-    def log_hyperparams(self, params: Any) -> None:
+    def log_hyperparams(self, params: Mapping[str, object]) -> None:
         """Log what the run does not have yet: MLflow refuses to change a parameter, and a resumed run may."""
         known = self.client.get_run(str(self.run_id)).data.params
         flat = flatten_settings(params)
@@ -174,9 +174,9 @@ def _keep_environment() -> Iterator[None]:
             os.environ[STORE_VARIABLE] = before
 
 
-def flatten_settings(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def flatten_settings(config: Mapping[str, object], prefix: str = "") -> dict[str, object]:
     """Nested settings by dotted name; `init_args` is left out, so `model.units` and not `model.init_args.units`."""
-    flat: dict[str, Any] = {}
+    flat: dict[str, object] = {}
     for key, value in config.items():
         name = prefix if key == "init_args" else f"{prefix}.{key}" if prefix else str(key)
         if isinstance(value, Mapping):
@@ -187,7 +187,7 @@ def flatten_settings(config: Mapping[str, Any], prefix: str = "") -> dict[str, A
 
 
 def find_last_run(
-    uri: str, experiment_name: str, checkpoints: Path, architecture: str, data: Mapping[str, Any]
+    uri: str, experiment_name: str, checkpoints: Path, architecture: str, data: Mapping[str, object]
 ) -> tuple[str, Path]:
     """Find the newest run of an architecture on a scene that left a `last.ckpt`.
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import subprocess
-from typing import Any
 
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback, Timer
@@ -102,7 +101,7 @@ _NOT_RECORDED = ("cache_dir", "workers", "eval_batch_size")
 """Settings of the data that do not change the result, and would show as differences where runs are compared."""
 
 
-def _collect_settings(trainer: Trainer, module: PoseModule) -> dict[str, Any]:
+def _collect_settings(trainer: Trainer, module: PoseModule) -> dict[str, object]:
     """The run's settings, nested, as parameters of the run: `MLflowLogger` flattens them."""
     datamodule = scene_datamodule(trainer)
     data = datamodule.describe()

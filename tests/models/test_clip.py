@@ -85,7 +85,7 @@ def test_integrated_networks_learn_the_scale_of_steps_and_others_that_of_clips()
 def test_metrics_leave_out_the_first_frame(monkeypatch: pytest.MonkeyPatch) -> None:
     problem, model = ClipProblem([6, 12]), make(CNN3D).eval()
     monkeypatch.setattr(model, "log_dict", lambda *args, **kwargs: None)
-    model._step(problem.learnt, "val")
+    model.validation_step(problem.learnt, 0)
     (errors,) = model.val_metrics.position_error_m
     assert len(errors) == problem.learnt.frame[:, 1:].numel()
 

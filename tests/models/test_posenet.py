@@ -68,7 +68,7 @@ def test_it_is_trained_on_random_crops(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (rows.min(), rows.max()) == (0, 8)
     assert (columns.min(), columns.max()) == (0, 12)
     model.eval()
-    model._step(batch, "val")
+    model.validation_step(batch, 0)
     assert (model.network.cnn.crops[-1][:, 0, 0, 0] * 255 == 4).all()  # type: ignore[union-attr, index]
 
 
