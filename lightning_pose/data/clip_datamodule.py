@@ -158,6 +158,7 @@ class ClipDataModule(SceneDataModule):
         return make_loader(clips, self.batch_size, shuffle=True)
 
     def _augmentation(self) -> Augmentation:
+        """The random changes to training clips that the settings ask for."""
         return Augmentation(True, self.max_stride, self.reverse, self.extractor.mirror if self.mirror else None)
 
 
@@ -176,6 +177,7 @@ def require_clips(datamodule: SceneDataModule) -> ClipDataModule:
 
 
 def _check_named_once(root: str | None, train_scenes: list[str] | None, test_scenes: list[str] | None) -> None:
+    """Raise ConfigError if scenes are named in two ways, or none to train on."""
     if root is not None and (train_scenes or test_scenes):
         raise ConfigError("data.root is one scene, and data.train_scenes and data.test_scenes are several; give either")
     if test_scenes is not None and not train_scenes:

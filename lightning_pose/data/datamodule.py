@@ -107,6 +107,7 @@ class SceneDataModule(LightningDataModule):
         return PoseDataset(data)
 
     def _read(self, split: str, cache: FeatureCache) -> PoseBatch:
+        """All frames of a split, features from a cache."""
         frames = [self.scene.frames[i] for i in self.scene.splits[split]]
         return PoseBatch(
             features=torch.from_numpy(cache.features([frame.image for frame in frames], workers=self.workers)),

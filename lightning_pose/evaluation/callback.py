@@ -99,6 +99,7 @@ def describe_run(logger: MLflowLogger, text: str) -> None:
 
 
 def _log_trajectories(logger: MLflowLogger, trajectories: Mapping[str, tuple[list[Frame], Pose]]) -> None:
+    """Write one TUM file per sequence to the run, in a folder for each kind of trajectory."""
     with tempfile.TemporaryDirectory() as folder:
         for name, (frames, pose) in trajectories.items():
             write_sequences(Path(folder) / name, frames, pose.position_m.numpy(), pose.quat_wxyz.numpy())

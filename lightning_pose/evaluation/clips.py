@@ -95,6 +95,7 @@ def evaluate_clips(
 
 
 def _metric_prefix(system: str, model: str) -> str:
+    """What the names of a system's metrics begin with."""
     return "test" if system == model else f"baseline/{system}"
 
 
@@ -160,6 +161,7 @@ def _cut_odometry(sequences: list[Sequence], clips: ClipDataset) -> Pose:
 
 
 def _summarize_clips(answer: Pose, truth: Pose) -> dict[str, float]:
+    """Metrics of relative poses (W, T, ...), first frames left out."""
     positions, quats = ([part[:, 1:] for part in pair] for pair in zip(answer, truth, strict=True))
     return summarize_errors(position_error_m(*positions), orientation_error_deg(*quats))
 
@@ -192,6 +194,14 @@ def _draw_clip_figures(
     sequences: list[Sequence],
     found: Mapping[int, Mapping[str, Mapping[str, float]]],
 ) -> dict[str, Figure]:
+    """The run's figures by file name.
+
+    Args:
+        datamodule: of the test.
+        name: the model's.
+        sequences: as `_chain_sequences` returns them.
+        found: metrics by clip length and system.
+    """
     scene = datamodule.scene
     shown = _title_sequences(sequences)
     lengths = list(found)
@@ -231,6 +241,7 @@ def _draw_responses(datamodule: ClipDataModule, module: PoseModule) -> Figure:
 
 
 def _join_trajectories(sequences: list[Sequence], name: str) -> dict[str, tuple[list[Frame], Pose]]:
+    """Frames with true poses (`truth`) and with the model's (`predictions`), sequence after sequence."""
     frames = [frame for s in sequences for frame in s.frames]
     parts = {"truth": [s.truth for s in sequences], "predictions": [s.systems[name] for s in sequences]}
     return {

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict
 from typing import Any, ClassVar, Literal, NamedTuple
 
@@ -19,6 +18,7 @@ from lightning_pose.geometry.quaternions import align_hemisphere, mean_quat, qua
 from lightning_pose.losses import LossConfig, PoseLoss
 from lightning_pose.metrics.pose_metrics import PoseMetrics
 from lightning_pose.models.parts.scaling import measure_columns, measure_poses
+from lightning_pose.models.parts.schedule import cosine_factor
 
 __all__ = ["Pose", "PoseModule"]
 
@@ -51,13 +51,14 @@ class PoseModule(LightningModule):
     | `decode_features` | seldom | features to poses, where that takes more than one call of `network` |
     | `decode_batch` | seldom | the same for a batch, where training differs from use |
     | `training_splits` | seldom | the splits whose poses end up in the weights |
+    | `memory` | seldom | with `TrainingMemory`: what the checkpoint carries of every training frame |
     | `reads_clips`, `check_data`, `training_poses`, `select_judged` | for clips | see `ClipModule` |
 
     With `standardize`, the seven numbers are in standard deviations around the mean training pose; otherwise they are
     metres and quaternion components. The loss always compares metres and quaternion components.
 
-    `models/parts/` has what several architectures share: `TrainingMemory` is for checkpoints that carry something of
-    every training frame. `ClosedFormModule` is a base class for networks that are solved, not trained in steps.
+    `ClosedFormModule` is the base class for networks that are solved instead of trained in steps; `models/parts/` has
+    what else several architectures share.
 
     Args:
         input_shape: shape of one frame's features; on the command line it follows from the data.
@@ -271,14 +272,7 @@ class PoseModule(LightningModule):
         if self.schedule == "constant":
             return optimizer
         steps = int(self.trainer.estimated_stepping_batches)
-        warmup = max(1, steps // 20)
-
-        def factor(step: int) -> float:
-            if step < warmup:
-                return (step + 1) / warmup
-            return 0.5 * (1 + math.cos(math.pi * (step - warmup) / max(1, steps - warmup)))
-
-        scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
+        scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: cosine_factor(step, steps))
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
     def describe(self) -> Spec:
@@ -286,6 +280,11 @@ class PoseModule(LightningModule):
         return {"class_path": class_path(self), "init_args": dict(self.hparams)}
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Refuse a checkpoint that does not suit this module, before any weight is loaded.
+
+        Raises:
+            CheckpointError: it is of another architecture, or its tensors have other shapes.
+        """
         saved = checkpoint.get("lightning_pose", {}).get("model", {}).get("class_path", class_path(self))
         saved = resolve_class_path(saved)
         if saved != class_path(self):
@@ -302,6 +301,7 @@ class PoseModule(LightningModule):
                 )
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Add the specs of the module and its data, from which `Localizer` rebuilds both."""
         datamodule = find_datamodule(self.trainer)
         checkpoint["lightning_pose"] = {
             "model": self.describe(),

@@ -131,6 +131,11 @@ class ClosedFormModule(PoseModule):
 
     @torch.no_grad()
     def _solve(self) -> None:
+        """Set the network to the solution with the best lambda.
+
+        Raises:
+            ConfigError: there are several lambdas and no validation frames.
+        """
         if self.trainer.world_size > 1:
             self.moments.all_reduce(partial(self.trainer.strategy.reduce, reduce_op="sum"))
         if len(self.lambdas) > 1 and not self._validates:
@@ -145,10 +150,12 @@ class ClosedFormModule(PoseModule):
 
     @property
     def _validates(self) -> bool:
+        """Whether there are validation frames."""
         return sum(self.trainer.num_val_batches) > 0
 
     def _val_loss(self, solution: Ridge) -> float:
-        # The mean loss, and not the median error: over so few frames that jumps from one lambda to the next.
+        """Sum of a solution's losses on validation frames, to which the network is set."""
+        # The loss, and not the median error: over so few frames that jumps from one lambda to the next.
         self.network.set_solution(solution)
         total = 0.0
         for batch in self._batches("val"):

@@ -75,6 +75,8 @@ class GraphPose(PoseModule):
 
 
 class _CellNetwork(nn.Module):
+    """Graph convolutions over the cells of maps, a readout over each map's nodes, and the heads of the pose."""
+
     def __init__(
         self,
         convolutions: list[GraphConvolution],

@@ -65,6 +65,7 @@ class BestCheckpoint(_RunCheckpoint):
         self._keep_metrics(trainer, before)
 
     def _keep_metrics(self, trainer: Trainer, before: Tensor | None) -> None:
+        """Keep the epoch's validation metrics if it is the best so far; `before` is the best score until now."""
         if self.best_model_score is not before:
             measured = trainer.callback_metrics.items()
             self._metrics = {f"best/{name}": float(v) for name, v in measured if name.startswith("val/")}
@@ -76,6 +77,7 @@ class BestCheckpoint(_RunCheckpoint):
         self._log_best(trainer)
 
     def _log_best(self, trainer: Trainer) -> None:
+        """Log the best epoch's validation metrics."""
         logger = run_logger(trainer)
         if logger is not None and self._metrics:
             logger.log_metrics(self._metrics)

@@ -37,19 +37,20 @@ class RunRecorder(Callback):
             return
         assert isinstance(pl_module, PoseModule)
         run_id = str(logger.run_id)
-        logger.client.update_run(run_id, status="RUNNING", name=self._name(trainer, pl_module, logger, stage))
+        logger.client.update_run(run_id, status="RUNNING", name=self._make_name(trainer, pl_module, logger, stage))
         if stage == "test" and logger.client.get_run(run_id).data.params:
             return  # the test that follows fit belongs to the same run
-        for name, value in self._tags(trainer, pl_module, stage).items():
+        for name, value in self._collect_tags(trainer, pl_module, stage).items():
             logger.client.set_tag(run_id, name, value)
         logger.log_hyperparams(_collect_settings(trainer, pl_module))
         if self.config_yaml is not None:
             logger.client.log_text(run_id, self.config_yaml, "config.yaml")
 
-    def _name(self, trainer: Trainer, module: PoseModule, logger: MLflowLogger, stage: str) -> str | None:
+    def _make_name(self, trainer: Trainer, module: PoseModule, logger: MLflowLogger, stage: str) -> str | None:
+        """The name of a new run; None for one that is resumed, which keeps its name."""
         kept = logger.client.get_run(str(logger.run_id)).data
         if kept.params:
-            return None  # a run that goes on keeps its name
+            return None
         scene, seed = scene_datamodule(trainer).scene.name, _read_seed()
         trial = kept.tags.get("sweep.trial")
         parts = (
@@ -61,7 +62,8 @@ class RunRecorder(Callback):
         return name if trial is None else f"{name} trial {trial}"
 
     @staticmethod
-    def _tags(trainer: Trainer, module: PoseModule, stage: str) -> dict[str, str]:
+    def _collect_tags(trainer: Trainer, module: PoseModule, stage: str) -> dict[str, str]:
+        """The run's tags, by name."""
         datamodule = scene_datamodule(trainer)
         scene = datamodule.scene
         tags = {
@@ -76,7 +78,7 @@ class RunRecorder(Callback):
             "features": datamodule.extractor.name,
             **_test_tags(datamodule, module),
         }
-        commit = _git_commit()
+        commit = _read_git_commit()
         return tags | ({"git_commit": commit} if commit else {})
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
@@ -134,11 +136,13 @@ def _test_tags(datamodule: SceneDataModule, module: PoseModule) -> dict[str, str
 
 
 def _read_seed() -> int | None:
+    """The seed that Lightning has set for this process."""
     seed = os.environ.get("PL_GLOBAL_SEED")
     return int(seed) if seed else None
 
 
-def _git_commit() -> str | None:
+def _read_git_commit() -> str | None:
+    """The commit of the current folder's checkout; None if it is not one."""
     try:
         answer = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, timeout=10)
     except (OSError, subprocess.TimeoutExpired):

@@ -156,6 +156,7 @@ def _estimate_steps(
 
 
 def _estimate_step(views: tuple[View, View]) -> tuple[Tensor, Tensor] | None:
+    """`match_motion` of two views; no motion between a view and itself."""
     if views[0] is views[1]:  # a frame repeated has not moved, which is no failure
         return torch.zeros(3).double(), torch.eye(4)[0].double()
     return match_motion(*views)

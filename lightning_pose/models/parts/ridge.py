@@ -188,6 +188,7 @@ class Moments:
         return Spectrum(values[kept].flip(0), vectors[:, kept].flip(1), mean[: self._sizes[0]])
 
     def _mean_and_cross(self) -> tuple[Tensor, Tensor]:
+        """Mean of features and targets (D + T,), and their centred products (D, T)."""
         if self._n_folded:
             self._fold()
             return self._mean, self._cross
@@ -197,6 +198,7 @@ class Moments:
         return mean, x.T @ y
 
     def _fold(self) -> None:
+        """Add the kept rows to the Gram matrix and the products, and forget them."""
         if not self._n_rows:
             return
         features, n, count = self._sizes[0], self._n_rows, self.count
