@@ -171,7 +171,7 @@ def test_a_clip_longer_than_every_run_is_refused() -> None:
         clips(8, stride=3)
 
 
-def test_short_runs_are_left_out_and_told(caplog: pytest.LogCaptureFixture) -> None:
+def test_short_runs_are_left_out_with_a_warning(caplog: pytest.LogCaptureFixture) -> None:
     dataset = ClipDataset(data(), [np.arange(10), np.arange(10, 13), np.arange(13, 30)], ClipShape(5))
     assert not {10, 11, 12} & set(dataset.rows().flatten().tolist())
     assert "1 of 3 runs of frames are shorter than a clip (5) and left out" in caplog.text

@@ -134,7 +134,7 @@ class ClipProblem(LearnableProblem, ClipDataModule):
             split: ClipDataset(frames.data, [np.arange(count)], shape) for split, frames in self.splits.items()
         }
         self.training_clips = self.clip_splits["train"]
-        # What a frame shows is its pose relative to the first frame of its clip, as it is to be told.
+        # A frame shows its pose relative to the first frame of its clip, which is the target.
         _, position_m, quat_wxyz, frame = self.training_clips.__getitems__(range(len(self.training_clips)))
         rows, columns = input_shape
         # In patches, because the networks' pools are averages.

@@ -154,7 +154,7 @@ def test_a_causal_network_answers_before_the_next_frame_comes(model: ClipModule)
 
 
 @every_network
-def test_others_hear_later_frames(network: type[ClipModule]) -> None:
+def test_others_depend_on_later_frames(network: type[ClipModule]) -> None:
     model = make(network).eval()
     features = features_for(model, 1).repeat(1, 3, 1, 1)
     assert not torch.allclose(model(features[:, :7]).position_m[:, 6], model(features).position_m[:, 6], atol=1e-5)

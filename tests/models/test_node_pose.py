@@ -1,4 +1,4 @@
-"""NodePose: what queries hear, what they must not, the memory in its checkpoint, and its sizes."""
+"""NodePose: what queries receive, the memory in its checkpoint, and its sizes."""
 # pyright: reportCallIssue=false, reportAttributeAccessIssue=false, reportIndexIssue=false
 # (torch types what modules hold as Tensor or Module, which layers here are known not to be)
 
@@ -56,7 +56,7 @@ def test_an_answer_does_not_depend_on_the_batch(conv: str, neighbour_poses: int)
     torch.testing.assert_close(decode(model, queries.repeat(3, 1))[:9], together, atol=1e-5, rtol=1e-5)
 
 
-def test_queries_never_hear_each_other() -> None:
+def test_queries_never_affect_each_other() -> None:
     model = make(neighbour_poses=2)
     queries = frames(4, seed=1).features.requires_grad_()
     for row, pose in enumerate(decode(model, queries)):

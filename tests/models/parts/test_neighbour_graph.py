@@ -58,7 +58,7 @@ def test_nodes_of_one_image_are_joined_to_each_other_alone() -> None:
     assert search_within_graph(LINE[None], 9).shape == (5, 4)
 
 
-def test_edges_lead_from_neighbours_to_the_node_that_hears_them() -> None:
+def test_edges_lead_from_neighbours_to_their_node() -> None:
     assert list_edges(torch.tensor([[1, 2], [0, ABSENT]])).tolist() == [[1, 2, 0], [0, 0, 1]]
 
 
@@ -74,7 +74,7 @@ def test_a_sample_holds_different_neighbours_of_the_node() -> None:
 
 
 def test_a_neighbourhood_is_what_its_seeds_depend_on() -> None:
-    chain = torch.tensor([[1], [2], [3], [4], [ABSENT], [0]])  # 0 hears 1, which hears 2, ...; 5 hears 0
+    chain = torch.tensor([[1], [2], [3], [4], [ABSENT], [0]])  # from 1 to 0, from 2 to 1, ...; from 0 to 5
     nodes, table, seeds = find_neighbourhood(chain, torch.tensor([1, 0]), hops=2)
     assert nodes.tolist() == [0, 1, 2, 3]
     assert table.tolist() == [[1], [2], [3], [ABSENT]]
