@@ -19,6 +19,7 @@ from lightning import Callback, Trainer
 from lightning.pytorch.callbacks import Timer
 
 from lightning_pose import models
+from lightning_pose.checkpoint import Spec
 from lightning_pose.data import SceneDataModule
 from lightning_pose.data.batches import PoseBatch, PoseDataset, make_loader
 from lightning_pose.features import SURF
@@ -59,8 +60,8 @@ class RandomData(SceneDataModule):
     def val_dataloader(self):
         return []
 
-    def describe(self) -> dict[str, str]:
-        return {"class_path": "benchmark"}
+    def describe(self) -> Spec:
+        return {"class_path": "benchmark", "init_args": {}}
 
 
 class EpochClock(Callback):
