@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from numpy.typing import ArrayLike
+
+if TYPE_CHECKING:
+    from matplotlib.typing import RcKeyType
 
 __all__ = [
     "BASELINES",
@@ -18,8 +21,9 @@ __all__ = [
     "TRAINING",
     "TRUTH",
     "Errors",
+    "find_log_limits",
+    "find_longest_axes",
     "log_axis",
-    "longest_axes",
 ]
 
 Errors = tuple[ArrayLike, ArrayLike]
@@ -36,9 +40,9 @@ BASELINES = {
 
 OTHERS = [("#CC79A7", (0, (5, 1.5))), ("#56B4E9", (0, (3, 1.5))), ("#882255", (0, (1, 1)))]
 
-SMALLEST = 1e-4  # a tenth of a millimetre, or its like in degrees: zero has no place on a logarithmic axis
+SMALLEST = 1e-4  # metres or degrees, drawn for zero, which a logarithmic axis cannot show
 
-STYLE: dict[Any, Any] = {
+STYLE: dict[RcKeyType, object] = {
     "font.family": "DejaVu Sans",
     "font.size": 10,
     "axes.titlesize": 12,
@@ -62,12 +66,13 @@ STYLE: dict[Any, Any] = {
 }
 
 
-def longest_axes(truth_m: np.ndarray) -> list[int]:
+def find_longest_axes(truth_m: np.ndarray) -> list[int]:
     """The two axes, in order, along which positions (N, 3) extend furthest."""
     return sorted(int(axis) for axis in np.argsort(-np.ptp(truth_m, axis=0), kind="stable")[:2])
 
 
 def nan_to_infinity(errors: ArrayLike) -> np.ndarray:
+    """Errors as an array in which infinity replaces NaN."""
     values = np.asarray(errors, float)
     return np.where(np.isnan(values), np.inf, values)
 

@@ -1,4 +1,4 @@
-"""Names under which runs and trials keep what later code looks up."""
+"""Names of the tags of MLflow runs and the user attributes of Optuna trials that the project writes and reads."""
 
 __all__ = ["CURVES", "METRICS", "NOTE", "PARENT_TAG", "PROCESS", "REASON", "RUN"]
 
