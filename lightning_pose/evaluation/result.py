@@ -7,10 +7,11 @@ from dataclasses import dataclass, field
 
 from matplotlib.figure import Figure
 
+from lightning_pose.metrics.catalog import MEDIANS, SKILLS
 from lightning_pose.models.base import Pose
 from lightning_pose.scenes.scene import Frame
 
-__all__ = ["Evaluation", "skill"]
+__all__ = ["Evaluation", "compute_skill"]
 
 
 @dataclass
@@ -32,9 +33,9 @@ class Evaluation:
     curves: Mapping[str, Mapping[int, float]] = field(default_factory=dict)
 
 
-def skill(model: Mapping[str, float], baseline: Mapping[str, float]) -> dict[str, float]:
-    """Model error over a baseline's: below 1, learning helped."""
-    pairs = {"test/skill_position": "position_median_m", "test/skill_orientation": "orientation_median_deg"}
+def compute_skill(model: Mapping[str, float], baseline: Mapping[str, float]) -> dict[str, float]:
+    """The model's median errors divided by a baseline's, as `test/skill_*`; below 1, the model is better."""
     return {
-        name: model[metric] / baseline[metric] if baseline[metric] else float("inf") for name, metric in pairs.items()
+        f"test/{name}": model[metric] / baseline[metric] if baseline[metric] else float("inf")
+        for name, metric in zip(SKILLS, MEDIANS, strict=True)
     }
