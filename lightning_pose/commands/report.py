@@ -65,10 +65,10 @@ def main(argv: list[str]) -> int:
     if args.chapter and not args.published:
         raise ConfigError("--chapter chooses among published rows; give --published as well")
     filters = Filters(
-        experiment=args.experiment,
-        systems=tuple(args.system),
-        scenes=tuple(args.scene),
-        tags=tuple(_pair(text) for text in args.tag),
+        experiments=[args.experiment] if args.experiment else [],
+        systems=args.system,
+        scenes=args.scene,
+        tags=[_pair(text) for text in args.tag],
         since=read_date(args.since) if args.since else None,
         until=read_date(args.until, end=True) if args.until else None,
         trials=args.trials,

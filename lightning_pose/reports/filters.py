@@ -11,9 +11,9 @@ from typing import NamedTuple
 from lightning_pose.errors import ConfigError
 from lightning_pose.runs.reader import Run
 
-__all__ = ["Date", "Filters", "check_setting", "read_date", "select_runs", "setting"]
+__all__ = ["Date", "Filters", "check_setting", "read_date", "select_runs"]
 
-MOST = 12
+MOST = 12  # values that a message lists
 
 
 class Date(NamedTuple):
@@ -25,10 +25,10 @@ class Date(NamedTuple):
 
 @dataclass(frozen=True)
 class Filters:
-    """What the runs must be; nothing is asked by default, but that no sweep ran them.
+    """What the runs must be; by default every run that no sweep made.
 
     Attributes:
-        experiment: name of the MLflow experiment.
+        experiments: names of MLflow experiments.
         systems: architectures.
         scenes: names of scenes.
         tags: (name, value) of tags or settings; values of one name are alternatives.
@@ -37,10 +37,10 @@ class Filters:
         trials: runs of sweeps as well.
     """
 
-    experiment: str | None = None
-    systems: tuple[str, ...] = ()
-    scenes: tuple[str, ...] = ()
-    tags: tuple[tuple[str, str], ...] = ()
+    experiments: Sequence[str] = ()
+    systems: Sequence[str] = ()
+    scenes: Sequence[str] = ()
+    tags: Sequence[tuple[str, str]] = ()
     since: Date | None = None
     until: Date | None = None
     trials: bool = False
@@ -55,36 +55,27 @@ def select_runs(runs: Sequence[Run], filters: Filters) -> tuple[list[Run], list[
     Raises:
         ConfigError: nothing passes; the message names the filter and the values that exist.
     """
-    notes = []
     kept = [run for run in runs if filters.trials or not run.trial]
     if not kept:
         raise ConfigError(f"all {len(runs)} finished runs are trials of sweeps; give --trials, or train with `fit`")
-    kept = _keep_values(
-        kept, "--experiment", [filters.experiment] if filters.experiment else [], lambda r: r.experiment
-    )
-    kept = _keep_values(kept, "--system", filters.systems, lambda run: run.system)
-    kept = _keep_values(kept, "--scene", filters.scenes, lambda run: run.scene)
+    kept = _keep_values(kept, "--experiment ", filters.experiments, lambda run: run.experiment)
+    kept = _keep_values(kept, "--system ", filters.systems, lambda run: run.system)
+    kept = _keep_values(kept, "--scene ", filters.scenes, lambda run: run.scene)
     for name in dict.fromkeys(name for name, _ in filters.tags):
         check_setting(name, kept)
         wanted = [value for other, value in filters.tags if other == name]
-        kept = _keep_values(kept, f"--tag {name}=", wanted, lambda run, name=name: setting(run, name))
-    kept = _keep_dates(kept, filters)
+        kept = _keep_values(kept, f"--tag {name}=", wanted, lambda run, name=name: run.settings.get(name))
+    kept = _keep_dates(kept, filters.since, filters.until)
     tested = [run for run in kept if "test/position_median_m" in run.metrics]
-    missing = len(kept) - len(tested)
     if not tested:
         trials = " (trials of a sweep never see test frames)" if any(run.trial for run in kept) else ""
         raise ConfigError(
             f"none of the {len(kept)} runs has test errors{trials}; "
             "measure a checkpoint with `python -m lightning_pose test --ckpt_path CKPT`"
         )
-    if missing:
-        notes.append(f"{missing} of {len(kept)} runs have no test errors, as most trials of sweeps: left out")
-    return tested, notes
-
-
-def setting(run: Run, name: str) -> str | None:
-    """A tag or a parameter by its name; None where the run has none."""
-    return run.settings.get(name)
+    missing = len(kept) - len(tested)
+    note = f"{missing} of {len(kept)} runs have no test errors, as most trials of sweeps: left out"
+    return tested, [note] if missing else []
 
 
 def check_setting(name: str, runs: Iterable[Run]) -> None:
@@ -122,30 +113,23 @@ def read_date(text: str, end: bool = False) -> Date:
         raise ConfigError(f"{text!r} is out of range; give a date such as 2026-03-01") from None
 
 
-def _keep_values(runs: list[Run], option: str, wanted: Sequence[str], value: Callable[[Run], str | None]) -> list[Run]:
+def _keep_values(runs: list[Run], option: str, wanted: Sequence[str], read: Callable[[Run], str | None]) -> list[Run]:
     """The runs whose value is one of those wanted; all where nothing is."""
-    if not wanted:
-        return runs
-    values = {run.run_id: value(run) for run in runs}
-    there = sorted({told for told in values.values() if told is not None}, key=str)
-    for want in wanted:
-        if want not in there:
-            more = f" and {len(there) - MOST} more" if len(there) > MOST else ""
-            said = option + want if option.endswith("=") else f"{option} {want}"
-            raise ConfigError(f"{said} matches no run; there is {', '.join(there[:MOST]) or 'none'}{more}")
-    return [run for run in runs if values[run.run_id] in wanted]
+    values = sorted({value for run in runs if (value := read(run)) is not None})
+    for value in wanted:
+        if value not in values:
+            more = f" and {len(values) - MOST} more" if len(values) > MOST else ""
+            listed = ", ".join(values[:MOST]) or "none"
+            raise ConfigError(f"{option}{value} matches no run; there is {listed}{more}")
+    return [run for run in runs if read(run) in wanted] if wanted else runs
 
 
-def _keep_dates(runs: list[Run], filters: Filters) -> list[Run]:
-    low = filters.since.milliseconds if filters.since else float("-inf")
-    high = filters.until.milliseconds if filters.until else float("inf")
+def _keep_dates(runs: list[Run], since: Date | None, until: Date | None) -> list[Run]:
+    low, high = since.milliseconds if since else float("-inf"), until.milliseconds if until else float("inf")
     kept = [run for run in runs if low <= run.started < high]
     if not kept:
-        first, last = (
-            datetime.fromtimestamp(end(run.started for run in runs) / 1e3).isoformat(" ", "minutes")
-            for end in (min, max)
-        )
-        dates = {"--since": filters.since, "--until": filters.until}
-        told = " ".join(f"{option} {date.text}" for option, date in dates.items() if date)
-        raise ConfigError(f"{told} matches no run; the {len(runs)} others are from {first} to {last}")
+        ends = (end(run.started for run in runs) / 1e3 for end in (min, max))
+        first, last = (datetime.fromtimestamp(seconds).isoformat(" ", "minutes") for seconds in ends)
+        options = " ".join(f"{name} {date.text}" for name, date in (("--since", since), ("--until", until)) if date)
+        raise ConfigError(f"{options} matches no run; the {len(runs)} others are from {first} to {last}")
     return kept

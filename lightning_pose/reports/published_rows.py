@@ -18,11 +18,10 @@ import csv
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
 from importlib.resources import files
 
-from lightning_pose.reports.comparability import tested
-from lightning_pose.reports.table import Cell, Mean, Report, Row, add_means
+from lightning_pose.reports.comparability import find_tested_fact
+from lightning_pose.reports.table import Cell, Report, Row, add_means
 
 __all__ = ["CHAPTERS", "FRAMES", "SCENES", "Published", "add_published", "published_systems"]
 
@@ -91,12 +90,11 @@ def published_systems(chapters: Iterable[int] = CHAPTERS) -> list[Published]:
     Args:
         chapters: whose tables.
     """
-    wanted = {str(chapter) for chapter in chapters}
     systems: dict[tuple[str, str], Published] = {}
-    for line in _read_published_lines("cell"):
-        if line["chapter"] in wanted:
-            key = line["table"], line["system"]
-            published = systems.setdefault(key, Published(line["system"], line["table"], line["task"]))
+    for line in _read_lines("cell"):
+        if int(line["chapter"]) in chapters:
+            published = Published(line["system"], line["table"], line["task"])
+            published = systems.setdefault((published.table, published.system), published)
             published.cells[line["scene"]] = _published_cell(line)
     return list(systems.values())
 
@@ -108,37 +106,34 @@ def add_published(report: Report, chapters: Sequence[int] = ()) -> None:
         report: gets rows, notes and footnotes.
         chapters: of the thesis; all, and means of other papers, if none is given.
     """
-    columns = {scene: name for scene in report.scenes if (name := _known(report, scene))}
+    columns = {scene: name for scene in report.scenes if (name := _published_name(report, scene))}
     if not columns:
         report.notes.append(
             f"no published row: none of the scenes on show ({', '.join(report.scenes)}) is one of 7-Scenes "
             f"or Cambridge with its original ground truth ({', '.join(SCENES)})"
         )
         return
-    rows: list[Row] = []
+    rows: dict[tuple[str, str], Row] = {}
     tables: set[str] = set()
     left_out: set[str] = set()
     for published in published_systems(chapters or CHAPTERS):
-        cells = {}
-        for scene, name in columns.items():
-            if name in published.cells:
-                if report.facts[scene].get("task", published.task) != published.task:
-                    left_out.add(published.task)
-                    continue
-                cells[scene] = published.cells[name]
-        if cells:
+        shared = {scene: name for scene, name in columns.items() if name in published.cells}
+        alike = [scene for scene in shared if report.facts[scene].get("task", published.task) == published.task]
+        if len(alike) < len(shared):
+            left_out.add(published.task)
+        if alike:
+            cells = {scene: published.cells[shared[scene]] for scene in alike}
             tables.add(published.table)
-            _merge(rows, published, cells)
-    add_means(report, rows)
-    means = _means(report, columns) if not chapters else []
-    report.rows += rows + means
+            _add_row(rows, published, cells)
+    add_means(report, list(rows.values()))
+    means = [] if chapters else _mean_rows(report, columns)
+    report.rows += [*rows.values(), *means]
     report.notes += [f"published rows of {task} poses are left out: those on show are not" for task in sorted(left_out)]
-    report.notes += [_comparable(report, columns)] if rows or means else ["no published row has the task on show"]
-    report.footnotes += _footnotes(sorted(tables), bool(means), set(columns.values()))
+    report.notes.append(_compare_scenes(report, columns) if rows or means else "no published row has the task on show")
+    report.footnotes += _list_sources(sorted(tables), bool(means), set(columns.values()))
 
 
-@cache
-def _read_published_lines(kind: str) -> list[dict[str, str]]:
+def _read_lines(kind: str) -> list[dict[str, str]]:
     """The lines of the CSV file of a kind, `cell` or `mean`, in the order of the tables."""
     text = files("lightning_pose.reports").joinpath("published_rows.csv").read_text(encoding="utf-8")
     return [line for line in csv.DictReader(text.splitlines()) if line["kind"] == kind]
@@ -146,87 +141,72 @@ def _read_published_lines(kind: str) -> list[dict[str, str]]:
 
 def _published_cell(line: Mapping[str, str]) -> Cell:
     """The errors of a line, as numbers and as printed; VidLoc has no orientation."""
-    position, orientation = line["position_m"], line["orientation_deg"]
-    return Cell(float(position), float(orientation) if orientation else None, text=(position, orientation))
+    text = line["position_m"], line["orientation_deg"]
+    return Cell((float(text[0]), float(text[1]) if text[1] else None), text=text)
 
 
-def _known(report: Report, scene: str) -> str | None:
+def _published_name(report: Report, scene: str) -> str | None:
     """The published name of a scene on show; that of the scene tested on, for a model trained elsewhere."""
     facts = report.facts[scene]
-    truth = GROUND_TRUTHS.get(tested(scene, facts, "dataset") or "7scenes")
-    if truth is None or (tested(scene, facts, "ground_truth") or truth) != truth:
+    truth = GROUND_TRUTHS.get(find_tested_fact(scene, facts, "dataset") or "7scenes")
+    if truth is None or (find_tested_fact(scene, facts, "ground_truth") or truth) != truth:
         return None
     return SCENES.get(re.sub("[ _-]", "", scene.rpartition(" to ")[2].lower()))
 
 
-def _merge(rows: list[Row], published: Published, cells: dict[str, Cell]) -> None:
-    """One row for tables that agree in all the cells on show."""
-    for row in rows:
-        if row.system == published.system and _values(row.cells) == _values(cells):
-            row.source += f", {published.table}"
-            row.features = row.source
-            return
-    source = f"table {published.table}"
-    rows.append(Row("published", published.system, source, cells, source=source))
+def _add_row(rows: dict[tuple[str, str], Row], published: Published, cells: dict[str, Cell]) -> None:
+    """Add a row, or the table's number to the row of another table that agrees in all the cells on show."""
+    key = published.system, str({scene: cell.errors for scene, cell in cells.items()})
+    row = rows.setdefault(key, Row("published", published.system, "", cells))
+    row.source += f", {published.table}" if row.source else f"table {published.table}"
+    row.features = row.source
 
 
-def _values(cells: dict[str, Cell]) -> dict[str, tuple[float, float | None]]:
-    return {scene: (cell.position_m, cell.orientation_deg) for scene, cell in cells.items()}
-
-
-def _means(report: Report, columns: dict[str, str]) -> list[Row]:
-    """Means over the seven scenes, which stand beside means over just these."""
+def _mean_rows(report: Report, columns: dict[str, str]) -> list[Row]:
+    """Means over the seven scenes as other papers quote them, where a column of the report is over just these."""
     absolute = {scene for scene in columns if report.facts[scene].get("task", "absolute") == "absolute"}
     seven = set(list(SCENES.values())[:SEVEN])
     for column, scenes in report.means.items():
         if len(scenes) == SEVEN and {columns[scene] for scene in scenes if scene in absolute} == seven:
-            return [_published_mean(column, line) for line in _read_published_lines("mean")]
+            rows = []
+            for line in _read_lines("mean"):
+                mean = {column: Cell(_published_cell(line).errors, scenes=SEVEN)}
+                rows.append(Row("published", line["system"], line["source"], {}, means=mean, source=line["source"]))
+            return rows
     if absolute:
         report.notes.append("published means over the seven scenes are left out: other scenes, or fewer, are on show")
     return []
 
 
-def _published_mean(column: str, line: Mapping[str, str]) -> Row:
-    cell = _published_cell(line)
-    mean = Mean(cell.position_m, cell.orientation_deg, SEVEN)
-    source = line["source"]
-    return Row("published", line["system"], source, {}, means={column: mean}, source=source)
-
-
-def _comparable(report: Report, columns: dict[str, str]) -> str:
-    """Whether the scenes on show are what was published."""
-    reasons = [why for scene, name in columns.items() for why in _differences(scene, name, report.facts[scene])]
+def _compare_scenes(report: Report, columns: dict[str, str]) -> str:
+    """A note on whether the scenes on show are what was published."""
+    reasons = [why for scene, name in columns.items() for why in _list_differences(scene, name, report.facts[scene])]
     if not reasons:
         return "published rows are of the same official test frames; image sizes and training may differ"
     return f"published rows are of the whole official test split and do not compare: {'; '.join(reasons)}"
 
 
-def _differences(scene: str, name: str, facts: Mapping[str, str]) -> list[str]:
+def _list_differences(scene: str, name: str, facts: Mapping[str, str]) -> list[str]:
     """What keeps the errors on a scene from comparing with published ones."""
     reasons = []
-    told, whole = facts.get("test_frames"), str(FRAMES[name])
-    # A scene that was only tested on gives the frames of its official split, and tells that it is unseen.
+    frames, whole = facts.get("test_frames"), str(FRAMES[name])
+    # A scene that was only tested on has the frames of its official split, and the split `unseen`.
     if facts.get("split", "official") not in ("official", "unseen"):
         reasons.append(f"{scene} has its own split ({facts['split']})")
-    elif told is None:
+    elif frames is None:
         reasons.append(f"{scene} may be a cut, no run tells how many of the {whole} test frames it has")
-    elif told != whole:
-        reasons.append(f"{scene} is a cut, {told} test frames of {whole}")
-    if facts.get("task") == "relative" and _seen(scene, facts):
-        asked = scene.rpartition(" to ")[2]
+    elif frames != whole:
+        reasons.append(f"{scene} is a cut, {frames} test frames of {whole}")
+    # Where no run records the split, the names say what was trained on.
+    learned, apart, asked = scene.rpartition(" to ")
+    seen = facts["split"] != "unseen" if "split" in facts else not apart or asked in learned.split("+")
+    if facts.get("task") == "relative" and seen:
         reasons.append(f"{asked} was seen in training, the scenes of published clips were not")
     return reasons
 
 
-def _seen(scene: str, facts: Mapping[str, str]) -> bool:
-    """Whether the scene tested on was trained on, by the split or, where no run records that, by the names."""
-    if "split" in facts:
-        return facts["split"] != "unseen"
-    learned, apart, asked = scene.rpartition(" to ")
-    return not apart or asked in learned.split("+")
-
-
-def _footnotes(tables: Sequence[str], means: bool, scenes: set[str]) -> list[str]:
+def _list_sources(tables: Sequence[str], means: bool, scenes: set[str]) -> list[str]:
+    """The footnotes: sources, what must be known about them, and what they are not."""
     notes = []
     if tables:
         notes.append(

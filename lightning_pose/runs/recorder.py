@@ -14,6 +14,7 @@ from lightning.pytorch.utilities.exceptions import SIGTERMException
 from lightning_pose.errors import ImageError
 from lightning_pose.runs.checkpoints import checkpoint_folder, run_logger
 from lightning_pose.runs.logger import MLflowLogger
+from lightning_pose.runs.tags import OPERATIONAL
 from lightning_pose.scenes.images import read_gray
 
 __all__ = ["RunRecorder", "train_seconds"]
@@ -95,14 +96,10 @@ def train_seconds(trainer: Trainer) -> float | None:
     return (timers[0].time_elapsed("train") or None) if timers else None
 
 
-_OF_THE_MACHINE = ("cache_dir", "workers", "eval_batch_size")
-"""Settings of the data that change nothing in the result, and would only differ where runs are compared."""
-
-
 def _settings(trainer: Trainer, module: LightningModule) -> dict[str, Any]:
     datamodule = trainer.datamodule  # type: ignore[attr-defined]
     data = datamodule.describe()
-    kept = {name: value for name, value in data["init_args"].items() if name not in _OF_THE_MACHINE}
+    kept = {name: value for name, value in data["init_args"].items() if name not in OPERATIONAL}
     return {
         # The name for the class path, which `config.yaml` has: MLflow's plots cut values off after some ten letters.
         "architecture": type(module).__name__,

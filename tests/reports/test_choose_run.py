@@ -18,7 +18,7 @@ def test_best_is_by_validation_and_never_by_test(table) -> None:
         FakeRun(test=(0.05, 1.0), val=math.nan, day=2),
     )
     (cell,) = report.rows[0].cells.values()
-    assert (cell.position_m, cell.candidates, len(cell.runs)) == (0.9, 3, 1)
+    assert (cell.errors[0], cell.candidates, len(cell.runs)) == (0.9, 3, 1)
     assert "best by val/position_median_m" in report.rule
     assert any("SurfLSTM on chess (1 of 3): runs without a validation metric" in note for note in report.notes)
 
@@ -66,8 +66,8 @@ def test_validation_on_different_frames_is_told(table) -> None:
 def test_spread_over_seeds(table) -> None:
     seeds = [FakeRun(test=(value, 10 * value), params={"seed": str(i)}) for i, value in enumerate((0.1, 0.2, 0.6))]
     (cell,) = table(*seeds, pick="spread").rows[0].cells.values()
-    assert (cell.position_m, cell.orientation_deg) == (pytest.approx(0.3), pytest.approx(3.0))
-    assert cell.position_std_m == pytest.approx(math.sqrt(0.07))  # (0.04 + 0.01 + 0.09) / 2
+    assert (cell.errors[0], cell.errors[1]) == (pytest.approx(0.3), pytest.approx(3.0))
+    assert cell.deviations[0] == pytest.approx(math.sqrt(0.07))  # (0.04 + 0.01 + 0.09) / 2
     assert len(cell.runs) == 3
 
 
@@ -89,7 +89,7 @@ def test_spread_counts_each_run_without_a_seed(table) -> None:
     runs = [FakeRun(test=(value, 1.0), params={"seed": "None"}) for value in (0.1, 0.2, 0.6)]
     report = table(*runs, pick="spread")
     (cell,) = report.rows[0].cells.values()
-    assert (len(cell.runs), cell.position_m) == (3, pytest.approx(0.3))
+    assert (len(cell.runs), cell.errors[0]) == (3, pytest.approx(0.3))
     assert not any("seeds" in note for note in report.notes)
 
 

@@ -39,7 +39,7 @@ def test_untested_runs_and_trials_are_left_out(runs: list[Run]) -> None:
 @pytest.mark.parametrize(
     ("filters", "kept"),
     [
-        ({"experiment": "graphs"}, [9]),
+        ({"experiments": ("graphs",)}, [9]),
         ({"systems": ("SurfLSTM",)}, [1, 5]),
         ({"scenes": ("fire", "chess")}, [1, 5, 9]),
         ({"tags": (("model.units", "200"),)}, [5]),
@@ -58,7 +58,7 @@ def test_filters(runs: list[Run], filters: dict[str, object], kept: list[int]) -
 @pytest.mark.parametrize(
     ("filters", "says"),
     [
-        ({"experiment": "graph"}, "--experiment graph matches no run; there is graphs, lightning_pose"),
+        ({"experiments": ("graph",)}, "--experiment graph matches no run; there is graphs, lightning_pose"),
         ({"systems": ("PoseNet",)}, "--system PoseNet matches no run; there is NodePose, SurfCNN, SurfLSTM"),
         ({"scenes": ("heads",)}, "--scene heads matches no run; there is chess, fire"),
         ({"tags": (("model.units", "1"),)}, "--tag model.units=1 matches no run; there is 100, 200"),
