@@ -1,8 +1,9 @@
 """Reference rows for the scenes on show: chosen, merged where tables agree, and marked as published.
 
-`published_rows.csv` has the errors, one a line: median error in metres and degrees on the official test split (`cell`),
-and means over the seven scenes that the field quotes, with the original ground truth (`mean`). Numbers are as
-printed, but for three kinds of slips that the chapters themselves show:
+`published_rows.csv` has the errors, one a line: medians in metres and degrees on the official test split (`cell`),
+and means over the seven scenes that the field quotes, with the original ground truth (`mean`). `published_scenes.csv`
+has the scenes, `published_remarks.csv` what a reader must know, by table, or by scene of tables 4.1 and 5.2. Numbers
+are as printed, but for three kinds of slips that the chapters themselves show:
 
 - Tables 2.3 and 3.2 name the scenes in another order than the later ones, yet seven of their rows from the literature
   are in the later order. These rows are read in that order.
@@ -17,7 +18,7 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.resources import files
 
 from lightning_pose.reports.comparability import find_tested_fact
@@ -34,37 +35,18 @@ SEVEN = 7
 GROUND_TRUTHS = {"7scenes": "original", "cambridge": "sfm"}
 """What the published errors of a dataset were measured against."""
 
-SCENES = {
-    "chess": "chess",
-    "fire": "fire",
-    "heads": "heads",
-    "office": "office",
-    "pumpkin": "pumpkin",
-    "redkitchen": "kitchen",
-    "stairs": "stairs",
-    "kingscollege": "kings",
-    "stmaryschurch": "mary",
-    "shopfacade": "shop",
-}
-"""Names of the datasets' folders, in small letters without spaces, hyphens and underscores, to the names below."""
 
-FRAMES = {
-    "chess": 2000, "fire": 2000, "heads": 1000, "office": 4000, "pumpkin": 2000, "kitchen": 5000, "stairs": 1000,
-    "kings": 343, "mary": 530, "shop": 103,
-}  # fmt: skip
+def _read_csv(name: str) -> list[dict[str, str]]:
+    """The lines of a CSV file of this package, in their order."""
+    text = files("lightning_pose.reports").joinpath(f"{name}.csv").read_text(encoding="utf-8")
+    return list(csv.DictReader(text.splitlines()))
+
+
+SCENES = {line["folder"]: line["name"] for line in _read_csv("published_scenes")}
+"""Folders of the datasets, in small letters without spaces, hyphens and underscores, to names of scenes in the rows."""
+
+FRAMES = {line["name"]: int(line["test_frames"]) for line in _read_csv("published_scenes")}
 """Test frames of the official splits."""
-
-REMARKS = {
-    "2.3": "the rows PoseNet, Posenet-U, G-PoseNet, Pose-L, Pose-H, VidLoc and Mobile-PoseNet of table 2.3 are read "
-    "in the order of scenes of tables 4.1 and 5.2, which its heading does not have",
-    "3.2": "the rows PoseNet, Posenet-U, G-PoseNet, Pose-L and Mobile-PoseNet of table 3.2 likewise",
-    "4.1": "table 4.1 gives G-PoseNet the cells that table 5.2 gives LSTM. PN",
-    "shop": "table 4.1's shop cell of Node-Pose (ImageNet), 0.8/47, is taken for 0.8/4.7",
-    "mary": "in tables 4.1 and 5.2, most cells of St Mary's below the chapter's own systems repeat the shop's of the "
-    "row above: as printed, but not to be relied on",
-    "6.1": "the clips of table 6.1 have 2 to 400 frames, of scenes that were not trained on",
-}
-"""What a reader of a table must know, by table, or by scene of tables 4.1 and 5.2."""
 
 
 @dataclass(frozen=True)
@@ -91,8 +73,8 @@ def published_systems(chapters: Iterable[int] = CHAPTERS) -> list[Published]:
         chapters: whose tables.
     """
     systems: dict[tuple[str, str], Published] = {}
-    for line in _read_lines("cell"):
-        if int(line["chapter"]) in chapters:
+    for line in _read_csv("published_rows"):
+        if line["kind"] == "cell" and int(line["chapter"]) in chapters:
             published = Published(line["system"], line["table"], line["task"])
             published = systems.setdefault((published.table, published.system), published)
             published.cells[line["scene"]] = _published_cell(line)
@@ -113,7 +95,7 @@ def add_published(report: Report, chapters: Sequence[int] = ()) -> None:
             f"or Cambridge with its original ground truth ({', '.join(SCENES)})"
         )
         return
-    rows: dict[tuple[str, str], Row] = {}
+    rows: dict[tuple[object, ...], Row] = {}
     tables: set[str] = set()
     left_out: set[str] = set()
     for published in published_systems(chapters or CHAPTERS):
@@ -133,12 +115,6 @@ def add_published(report: Report, chapters: Sequence[int] = ()) -> None:
     report.footnotes += _list_sources(sorted(tables), bool(means), set(columns.values()))
 
 
-def _read_lines(kind: str) -> list[dict[str, str]]:
-    """The lines of the CSV file of a kind, `cell` or `mean`, in the order of the tables."""
-    text = files("lightning_pose.reports").joinpath("published_rows.csv").read_text(encoding="utf-8")
-    return [line for line in csv.DictReader(text.splitlines()) if line["kind"] == kind]
-
-
 def _published_cell(line: Mapping[str, str]) -> Cell:
     """The errors of a line, as numbers and as printed; VidLoc has no orientation."""
     text = line["position_m"], line["orientation_deg"]
@@ -154,9 +130,9 @@ def _published_name(report: Report, scene: str) -> str | None:
     return SCENES.get(re.sub("[ _-]", "", scene.rpartition(" to ")[2].lower()))
 
 
-def _add_row(rows: dict[tuple[str, str], Row], published: Published, cells: dict[str, Cell]) -> None:
+def _add_row(rows: dict[tuple[object, ...], Row], published: Published, cells: dict[str, Cell]) -> None:
     """Add a row, or the table's number to the row of another table that agrees in all the cells on show."""
-    key = published.system, str({scene: cell.errors for scene, cell in cells.items()})
+    key = published.system, *((scene, cell.errors) for scene, cell in cells.items())
     row = rows.setdefault(key, Row("published", published.system, "", cells))
     row.source += f", {published.table}" if row.source else f"table {published.table}"
     row.features = row.source
@@ -169,9 +145,10 @@ def _mean_rows(report: Report, columns: dict[str, str]) -> list[Row]:
     for column, scenes in report.means.items():
         if len(scenes) == SEVEN and {columns[scene] for scene in scenes if scene in absolute} == seven:
             rows = []
-            for line in _read_lines("mean"):
-                mean = {column: Cell(_published_cell(line).errors, scenes=SEVEN)}
-                rows.append(Row("published", line["system"], line["source"], {}, means=mean, source=line["source"]))
+            for line in [line for line in _read_csv("published_rows") if line["kind"] == "mean"]:
+                mean = replace(_published_cell(line), text=None, scenes=SEVEN)
+                source = line["source"]
+                rows.append(Row("published", line["system"], source, {}, means={column: mean}, source=source))
             return rows
     if absolute:
         report.notes.append("published means over the seven scenes are left out: other scenes, or fewer, are on show")
@@ -213,7 +190,8 @@ def _list_sources(tables: Sequence[str], means: bool, scenes: set[str]) -> list[
             f"{SOURCE}, table{'s' if len(tables) > 1 else ''} {', '.join(tables)}: cells as printed, means recomputed "
             "from them, so that the tables' own averages may differ; the chapters disagree with each other in places"
         )
-        notes += [remark for about, remark in REMARKS.items() if about in (*tables, *scenes)]
+        remarks = _read_csv("published_remarks")
+        notes += [line["remark"] for line in remarks if line["about"] in (*tables, *scenes)]
     if means:
         notes.append("means over the seven scenes, original ground truth, as the literature quotes them: no cells")
     if notes:
