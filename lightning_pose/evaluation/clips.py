@@ -15,7 +15,7 @@ from lightning_pose.evaluation.baselines.clips import constant_velocity, no_moti
 from lightning_pose.evaluation.baselines.visual_odometry import visual_odometry
 from lightning_pose.evaluation.costs import costs
 from lightning_pose.evaluation.responses import layer_responses
-from lightning_pose.evaluation.result import Evaluation, compute_skill
+from lightning_pose.evaluation.result import Evaluation, skill
 from lightning_pose.figures import clips as clip_figures
 from lightning_pose.geometry.quaternions import orientation_error_deg, position_error_m, quat_rotate
 from lightning_pose.geometry.relative import absolute_poses, relative_poses
@@ -71,8 +71,7 @@ def evaluate_clips(
         for system in found[lengths[0]]
         for metric in MEDIANS
     }
-    extras = compute_skill(model, baselines[reference_baseline(clips=True)])
-    extras |= costs(trainer, module, datamodule.clip_length)
+    extras = skill(model, baselines[reference_baseline(clips=True)]) | costs(trainer, module, datamodule.clip_length)
     for system, metrics in tracked.items():
         extras |= {f"{_prefix(system, name)}/{metric}": value for metric, value in metrics.items()}
     if odometry:

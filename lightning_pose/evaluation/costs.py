@@ -20,7 +20,7 @@ __all__ = ["costs", "count_layers"]
 def costs(
     trainer: Trainer, module: LightningModule, frames: int = 1, split: str = "test", features: bool = True
 ) -> dict[str, float]:
-    """Measure the costs of `catalog.COSTS`: to train, to keep, and per frame, features and network apart.
+    """What the localizer costs: to train, to keep, and per frame, features and network apart.
 
     Args:
         trainer: after a test, or after training.
@@ -39,11 +39,11 @@ def costs(
     found = {
         "cost/parameters": float(sum(p.numel() for p in module.network.parameters())),  # type: ignore[union-attr]
         "cost/layers": float(count_layers(module.network)),  # type: ignore[arg-type]
-        "cost/ms_per_frame": _median_milliseconds(locate, len(held) - frames + 1) / frames,
+        "cost/ms_per_frame": _milliseconds(locate, len(held) - frames + 1) / frames,
         "cost/frame_bytes": float(held[0].numel() * held.element_size()),
     }
     if features:
-        found["cost/features_ms_per_frame"] = _measure_features_ms(datamodule, split)
+        found["cost/features_ms_per_frame"] = _features_milliseconds(datamodule, split)
     best = checkpoint_folder(trainer) / "best.ckpt"
     if best.is_file():
         found["cost/checkpoint_bytes"] = float(best.stat().st_size)
@@ -63,13 +63,13 @@ def count_layers(module: nn.Module) -> int:
     return own + sum(count_layers(child) for child in module.children())
 
 
-def _measure_features_ms(datamodule: Any, split: str) -> float:
+def _features_milliseconds(datamodule: Any, split: str) -> float:
     extractor, scene = datamodule.extractor, datamodule.scene
     files = [scene.frames[i].image for i in scene.splits[split][:10]]
-    return _median_milliseconds(lambda i: extractor.extract([extractor.read(files[i])]), len(files))
+    return _milliseconds(lambda i: extractor.extract([extractor.read(files[i])]), len(files))
 
 
-def _median_milliseconds(work: Callable[[int], Any], count: int, most: int = 30) -> float:
+def _milliseconds(work: Callable[[int], Any], count: int, most: int = 30) -> float:
     """Median time of one call, after one that warms up."""
     times = []
     with torch.inference_mode():

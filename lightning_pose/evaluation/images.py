@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from lightning_pose.data.batches import PoseBatch
 from lightning_pose.evaluation.baselines.images import BaselineResult, evaluate_baselines
 from lightning_pose.evaluation.costs import costs
-from lightning_pose.evaluation.result import Evaluation, compute_skill
+from lightning_pose.evaluation.result import Evaluation, skill
 from lightning_pose.figures import images as image_figures
 from lightning_pose.geometry.quaternions import orientation_error_deg, position_error_m
 from lightning_pose.metrics.catalog import reference_baseline
@@ -52,7 +52,7 @@ def evaluate_images(
     metrics = {system: result.metrics for system, result in baselines.items()}
     return Evaluation(
         baselines=metrics,
-        extras=compute_skill(model, metrics[reference_baseline(clips=False)]) | costs(trainer, module),
+        extras=skill(model, metrics[reference_baseline(clips=False)]) | costs(trainer, module),
         trajectories={"truth": (frames, Pose(test.position_m, test.quat_wxyz)), "predictions": (frames, prediction)},
         figures=_figures(scene, name, train, test, poses),
     )

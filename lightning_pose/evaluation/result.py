@@ -11,7 +11,7 @@ from lightning_pose.metrics.catalog import MEDIANS, SKILLS
 from lightning_pose.models.base import Pose
 from lightning_pose.scenes.scene import Frame
 
-__all__ = ["Evaluation", "compute_skill"]
+__all__ = ["Evaluation", "skill"]
 
 
 @dataclass
@@ -33,7 +33,7 @@ class Evaluation:
     curves: Mapping[str, Mapping[int, float]] = field(default_factory=dict)
 
 
-def compute_skill(model: Mapping[str, float], baseline: Mapping[str, float]) -> dict[str, float]:
+def skill(model: Mapping[str, float], baseline: Mapping[str, float]) -> dict[str, float]:
     """The model's median errors divided by a baseline's, as `test/skill_*`; below 1, the model is better."""
     return {
         f"test/{name}": model[metric] / baseline[metric] if baseline[metric] else float("inf")
