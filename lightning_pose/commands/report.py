@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 from contextlib import nullcontext
 from functools import partial
@@ -41,7 +40,7 @@ left in MLflow.
 RULES = """Several runs of a system on a scene are joined by --pick:
 
   best     the run with the lowest validation error (val/position_median_m, else val/loss, of its best epoch, or of its
-           last where it does not tell that one). Test errors never choose. Where no run has one, the newest.
+           last where it lacks that). Test errors never choose. Where no run has one, the newest.
   latest   the newest run
   spread   mean and standard deviation over runs that differ in nothing but seed_everything (and in the folder of the
            same data); others are refused, or get rows of their own with --by NAME
@@ -64,7 +63,7 @@ def main(argv: list[str]) -> int:
     args = _build_parser().parse_args(argv)
     # Only now, so that `--help` is there at once.
     from lightning_pose.reports.baseline_rows import add_baselines
-    from lightning_pose.reports.filters import Filters, read_date, select_runs
+    from lightning_pose.reports.filters import Filters, select_runs
     from lightning_pose.reports.published_rows import add_published
     from lightning_pose.reports.table import build_report
     from lightning_pose.runs.reader import read_runs
@@ -76,8 +75,8 @@ def main(argv: list[str]) -> int:
         systems=args.system,
         scenes=args.scene,
         tags=[_split_tag(text) for text in args.tag],
-        since=read_date(args.since) if args.since else None,
-        until=read_date(args.until, end=True) if args.until else None,
+        since=args.since,
+        until=args.until,
         trials=args.trials,
     )
     form = args.format or _choose_format(args.out)
@@ -89,26 +88,21 @@ def main(argv: list[str]) -> int:
         add_baselines(report)
     if args.published:
         add_published(report, args.chapter)
+    report.further = tuple(name for name in ("skill", "costs") if getattr(args, name))
     if args.skill:
         images, clips = reference_baseline(clips=False), reference_baseline(clips=True)
         report.notes.append(f"skill is model error over that of {images} ({clips} for clips); below 1, learning helped")
-    if (args.skill or args.costs) and len(report.scenes) > 1:
+    if report.further and len(report.scenes) > 1:
         report.notes.append("skill and costs are means over the scenes of a row")
-    _write_report(report, form, args)
+    _write_report(report, form, args.out)
     return 0
 
 
-def _write_report(report: Report, form: str, args: argparse.Namespace) -> None:
+def _write_report(report: Report, form: str, out: Path | None) -> None:
     from lightning_pose.reports.data_formats import as_csv, as_json
-    from lightning_pose.reports.text_formats import Shown, as_latex, as_markdown, print_table
+    from lightning_pose.reports.text_formats import as_latex, as_markdown, print_table
 
-    shown, out = Shown(args.costs, args.skill), args.out
-    text = {
-        "markdown": lambda: as_markdown(report, shown),
-        "latex": lambda: as_latex(report, shown),
-        "csv": lambda: as_csv(report),
-        "json": lambda: as_json(report),
-    }
+    writers = {"markdown": as_markdown, "latex": as_latex, "csv": as_csv, "json": as_json}
     for note in (*report.notes, *report.footnotes) if form in ("csv", "latex") else ():
         print(f"note: {note}", file=sys.stderr)
     try:
@@ -116,9 +110,9 @@ def _write_report(report: Report, form: str, args: argparse.Namespace) -> None:
             out.parent.mkdir(parents=True, exist_ok=True)
         with nullcontext(sys.stdout) if out is None else out.open("w", encoding="utf-8") as file:
             if form == "table":
-                print_table(report, shown, file)
+                print_table(report, file)
             else:
-                print(text[form](), file=file)
+                print(writers[form](report), file=file)
     except OSError as error:
         if out is None:
             raise

@@ -1,4 +1,4 @@
-"""An evaluation: everything that a test says beside the model's own metrics."""
+"""The result of a test beside the model's own metrics: baselines, costs, curves, trajectories, figures."""
 
 from __future__ import annotations
 

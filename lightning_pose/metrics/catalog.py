@@ -14,9 +14,9 @@ __all__ = [
     "TRAJECTORY",
     "Baseline",
     "Metric",
+    "define_recall",
     "find_metric",
     "format_number",
-    "recall",
     "reference_baseline",
 ]
 
@@ -57,7 +57,7 @@ class Metric(NamedTuple):
         return format(value, self.form) if self.form else format_number(value)
 
 
-def recall(metres: float, degrees: float, printed: bool = True, described: bool = False) -> Metric:
+def define_recall(metres: float, degrees: float, printed: bool = True, described: bool = False) -> Metric:
     """The share of frames within both bounds, which count as within."""
     length = f"{metres * 100:g} cm" if metres < 1 else f"{metres:g} m"
     title, heading = f"share of frames within {length} and {degrees:g}°", f"{length}\n{degrees:g} deg"
@@ -71,13 +71,13 @@ ERRORS = {
     "orientation_mean_deg": Metric("mean orientation error", "°", "mean\ndeg", ".2f"),
     "position_p95_m": Metric("95th percentile of position errors", "m", "95 %\nm", ".3f", described=True),
     "orientation_p95_deg": Metric("95th percentile of orientation errors", "°", "95 %\ndeg", ".2f", described=True),
-    "recall_1cm_1deg": recall(0.01, 1.0, printed=False),
-    "recall_2cm_2deg": recall(0.02, 2.0, printed=False),
-    "recall_5cm_5deg": recall(0.05, 5.0, described=True),
-    "recall_10cm_5deg": recall(0.10, 5.0, described=True),
-    "recall_25cm_2deg": recall(0.25, 2.0),
-    "recall_50cm_5deg": recall(0.50, 5.0),
-    "recall_5m_10deg": recall(5.0, 10.0, printed=False),
+    "recall_1cm_1deg": define_recall(0.01, 1.0, printed=False),
+    "recall_2cm_2deg": define_recall(0.02, 2.0, printed=False),
+    "recall_5cm_5deg": define_recall(0.05, 5.0, described=True),
+    "recall_10cm_5deg": define_recall(0.10, 5.0, described=True),
+    "recall_25cm_2deg": define_recall(0.25, 2.0),
+    "recall_50cm_5deg": define_recall(0.50, 5.0),
+    "recall_5m_10deg": define_recall(5.0, 10.0, printed=False),
 }
 """What `summarize_errors` returns: `test/NAME` and `val/NAME` of the model, `baseline/BASELINE/NAME` of a baseline."""
 

@@ -52,7 +52,7 @@ class Choice:
             return "mean and sample standard deviation over n seeds"
         if pick == "latest":
             return "the newest run of each system and scene"
-        last = f" (of its last, for {self.by_last} of {self.judged} runs that do not tell their best)"
+        last = f" (of its last, for {self.by_last} of {self.judged} runs that do not record their best)"
         return (
             f"of each system and scene, the run that is best by {' or '.join(self.by) or VALIDATION[0]} of its best "
             f"epoch{last if self.by_last else ''}; never by test errors"
@@ -74,7 +74,7 @@ def pick_runs(runs: Sequence[Run], pick: Pick, cell: str, choice: Choice) -> lis
         choice: takes notes.
 
     Raises:
-        ConfigError: runs to average differ in a setting, or all are runs of `test`, which know no seed.
+        ConfigError: runs to average differ in a setting, or all are runs of `test`, which have no seed.
     """
     if pick == "latest":
         return [runs[0]]
@@ -103,7 +103,7 @@ def _pick_seeds(runs: Sequence[Run], cell: str, choice: Choice) -> list[Run]:
     trained = [run for run in runs if run.tags.get("verb") == "fit"]
     if not trained:
         raise ConfigError(
-            f"{cell}: {len(runs)} runs of `test`, which do not know the seed of their training, cannot be averaged; "
+            f"{cell}: {len(runs)} runs of `test`, which do not have the seed of their training, cannot be averaged; "
             "give --pick latest"
         )
     if len(trained) < len(runs):

@@ -71,7 +71,9 @@ def missing_facts(runs: Sequence[Run]) -> list[str]:
     if not any(missing.values()):
         return []
     names = ", ".join(fact.replace("_", " ") for fact, count in missing.items() if count)
-    return [f"{max(missing.values())} of {len(runs)} runs do not tell {names}: taken to match the others, not checked"]
+    return [
+        f"{max(missing.values())} of {len(runs)} runs do not record {names}: taken to match the others, not checked"
+    ]
 
 
 def describe_facts(facts: Mapping[str, str]) -> str:
@@ -85,7 +87,7 @@ def describe_facts(facts: Mapping[str, str]) -> str:
     parts += [caption.format(facts[fact]) for fact, caption in CAPTIONS.items() if fact in facts]
     if facts.get("unit", "m") != "m":
         parts.append("positions in units of the scene, not metres")
-    return ", ".join(parts) or "nothing told of split and ground truth"
+    return ", ".join(parts) or "split and ground truth unknown"
 
 
 def find_tested_fact(scene: str, facts: Mapping[str, str], fact: str) -> str | None:

@@ -22,7 +22,7 @@ def as_csv(report: Report) -> str:
     their mean where there are several. `kind` is own, baseline or published; `n` is how many runs a cell has, or how
     many scenes a mean is over; `runs` are MLflow's ids, separated by spaces.
     """
-    facts = list(dict.fromkeys(fact for told in report.facts.values() for fact in told))
+    facts = list(dict.fromkeys(fact for scene in report.scenes for fact in report.facts[scene]))
     errors = (*MEDIANS, *STANDARD_DEVIATIONS)
     columns = ["features", "scene", *errors, "n", *SKILLS, *COSTS, *facts, "source", "runs"]
     by = [name for row in report.rows[:1] for name in row.settings if name not in ("kind", "system", *columns)]

@@ -6,21 +6,13 @@ import difflib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
-from typing import NamedTuple
 
 from lightning_pose.errors import ConfigError
 from lightning_pose.runs.reader import Run
 
-__all__ = ["Date", "Filters", "check_setting", "read_date", "select_runs"]
+__all__ = ["Filters", "check_setting", "read_date", "select_runs"]
 
 MOST = 12  # values that a message lists
-
-
-class Date(NamedTuple):
-    """A moment, in milliseconds since 1970 as MLflow counts them, and the text that the user gave for it."""
-
-    text: str
-    milliseconds: float
 
 
 @dataclass(frozen=True)
@@ -32,8 +24,8 @@ class Filters:
         systems: architectures.
         scenes: names of scenes.
         tags: (name, value) of tags or settings; values of one name are alternatives.
-        since: when they started, at the earliest.
-        until: when they started, before this.
+        since: when they started, at the earliest: an ISO date or time.
+        until: when they started, before this time or the end of this day.
         trials: runs of sweeps as well.
     """
 
@@ -41,8 +33,8 @@ class Filters:
     systems: Sequence[str] = ()
     scenes: Sequence[str] = ()
     tags: Sequence[tuple[str, str]] = ()
-    since: Date | None = None
-    until: Date | None = None
+    since: str | None = None
+    until: str | None = None
     trials: bool = False
 
 
@@ -89,11 +81,11 @@ def check_setting(name: str, runs: Iterable[Run]) -> None:
         return
     near = [other for other in known if other.rpartition(".")[2] == name] or difflib.get_close_matches(name, known, 3)
     hint = f"did you mean {' or '.join(near)}?" if near else "settings are named as on the command line of fit"
-    raise ConfigError(f"no run tells {name!r}, neither as a tag nor as a setting; {hint}")
+    raise ConfigError(f"no run has {name!r}, neither as a tag nor as a setting; {hint}")
 
 
-def read_date(text: str, end: bool = False) -> Date:
-    """An ISO date or time, of this machine's clock unless it names a zone.
+def read_date(text: str, end: bool = False) -> float:
+    """The milliseconds since 1970, as MLflow counts them, of an ISO date or time; local time unless it names a zone.
 
     Args:
         text: such as `2026-03-01` or `2026-03-01T18:00`.
@@ -108,7 +100,7 @@ def read_date(text: str, end: bool = False) -> Date:
         raise ConfigError(f"{text!r} is no date; give one as 2026-03-01 or 2026-03-01T18:00") from None
     whole_day = len(text) <= len("2026-03-01") and "T" not in text
     try:
-        return Date(text, (date + timedelta(days=1) if end and whole_day else date).astimezone().timestamp() * 1e3)
+        return (date + timedelta(days=1) if end and whole_day else date).astimezone().timestamp() * 1e3
     except (ValueError, OverflowError, OSError):  # which of them depends on the system
         raise ConfigError(f"{text!r} is out of range; give a date such as 2026-03-01") from None
 
@@ -124,12 +116,13 @@ def _keep_values(runs: list[Run], option: str, wanted: Sequence[str], read: Call
     return [run for run in runs if read(run) in wanted] if wanted else runs
 
 
-def _keep_dates(runs: list[Run], since: Date | None, until: Date | None) -> list[Run]:
-    low, high = since.milliseconds if since else float("-inf"), until.milliseconds if until else float("inf")
+def _keep_dates(runs: list[Run], since: str | None, until: str | None) -> list[Run]:
+    low = read_date(since) if since else float("-inf")
+    high = read_date(until, end=True) if until else float("inf")
     kept = [run for run in runs if low <= run.started < high]
     if not kept:
         ends = (end(run.started for run in runs) / 1e3 for end in (min, max))
         first, last = (datetime.fromtimestamp(seconds).isoformat(" ", "minutes") for seconds in ends)
-        options = " ".join(f"{name} {date.text}" for name, date in (("--since", since), ("--until", until)) if date)
+        options = " ".join(f"{name} {date}" for name, date in (("--since", since), ("--until", until)) if date)
         raise ConfigError(f"{options} matches no run; the {len(runs)} others are from {first} to {last}")
     return kept

@@ -2,7 +2,7 @@
 
 `published_rows.csv` has the errors, one a line: medians in metres and degrees on the official test split (`cell`),
 and means over the seven scenes that the field quotes, with the original ground truth (`mean`). `published_scenes.csv`
-has the scenes, `published_remarks.csv` what a reader must know, by table, or by scene of tables 4.1 and 5.2. Numbers
+has the scenes, `published_remarks.csv` remarks by table, or by scene of tables 4.1 and 5.2. Numbers
 are as printed, but for three kinds of slips that the chapters themselves show:
 
 - Tables 2.3 and 3.2 name the scenes in another order than the later ones, yet seven of their rows from the literature
@@ -171,7 +171,7 @@ def _list_differences(scene: str, name: str, facts: Mapping[str, str]) -> list[s
     if facts.get("split", "official") not in ("official", "unseen"):
         reasons.append(f"{scene} has its own split ({facts['split']})")
     elif frames is None:
-        reasons.append(f"{scene} may be a cut, no run tells how many of the {whole} test frames it has")
+        reasons.append(f"{scene} may be a cut, no run records how many of the {whole} test frames it has")
     elif frames != whole:
         reasons.append(f"{scene} is a cut, {frames} test frames of {whole}")
     # Where no run records the split, the names say what was trained on.

@@ -102,15 +102,16 @@ class Row:
 
 @dataclass
 class Report:
-    """A table, and what its reader must know.
+    """A table with its notes.
 
     Attributes:
         scenes: the columns.
         facts: what the runs of a scene share, by scene.
         rows: own ones first, then baselines, then published ones.
         rule: how runs of one cell were joined.
-        notes: what the reader must know.
+        notes: on choices, on what was left out, and on what does not compare.
         footnotes: sources of published rows.
+        further: which columns a table has beside the scenes: `skill`, `costs`.
     """
 
     scenes: list[str]
@@ -119,6 +120,7 @@ class Report:
     rule: str
     notes: list[str]
     footnotes: list[str] = field(default_factory=list)
+    further: tuple[str, ...] = ()
 
     @property
     def means(self) -> dict[str, list[str]]:
@@ -204,16 +206,17 @@ def _differing_facts(report: Report, scenes: Sequence[str], facts: Sequence[str]
 
 
 def _build_row(system: str, settings: dict[str, str], runs: dict[str, list[Run]], pick: Pick, choice: Choice) -> Row:
-    told = ", ".join(f"{name.rpartition('.')[2]}={value}" for name, value in settings.items() if value != UNKNOWN)
-    label = f"{system} ({told})" if told else system
+    named = [f"{name.rpartition('.')[2]}={value}" for name, value in settings.items() if value != UNKNOWN]
+    label = f"{system} ({', '.join(named)})" if named else system
     cells = {}
     for scene, found in runs.items():
         if found:
             cells[scene] = _join_runs(pick_runs(found, pick, f"{label} on {scene}", choice), len(found))
     shown = [run for cell in cells.values() for run in cell.runs]
     if len(cells) > 1 and (names := differing_settings(shown, SETTINGS_OF_SCENES)):
-        told = ", ".join(f"{name} ({', '.join(values)})" for name, values in list(names.items())[:4])
-        choice.notes.append(f"{label} has other settings in other scenes: {told}{', ...' if len(names) > 4 else ''}")
+        listed = [f"{name} ({', '.join(values)})" for name, values in names.items()]
+        others = ", ".join(listed[:4] + ["..."] * (len(listed) > 4))
+        choice.notes.append(f"{label} has other settings in other scenes: {others}")
     return Row("own", label, ", ".join(dict.fromkeys(run.features for run in shown)), cells, settings)
 
 

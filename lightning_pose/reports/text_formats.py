@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 import re
 import sys
-from dataclasses import dataclass
 from typing import TextIO
 
 from lightning_pose.metrics.catalog import COSTS, ERRORS, MEDIANS, SKILLS
 from lightning_pose.reports.table import Cell, Report, Row
 
-__all__ = ["Shown", "as_latex", "as_markdown", "print_table"]
+__all__ = ["as_latex", "as_markdown", "print_table"]
 
 MARK = "†"
 ABSENT = "–"  # noqa: RUF001
@@ -25,25 +24,11 @@ TEX = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Shown:
-    """Which columns a table has beside the scenes.
-
-    Attributes:
-        costs: what a system costs.
-        skill: model error over that of the first baseline.
-    """
-
-    costs: bool = False
-    skill: bool = False
-
-
-def print_table(report: Report, shown: Shown, file: TextIO | None = None) -> None:
+def print_table(report: Report, file: TextIO | None = None) -> None:
     """Print the table, and the notes below it.
 
     Args:
         report: what to show.
-        shown: further columns.
         file: other than the terminal.
     """
     from rich.console import Console
@@ -51,7 +36,7 @@ def print_table(report: Report, shown: Shown, file: TextIO | None = None) -> Non
     from rich.table import Table
 
     stream: TextIO = sys.stdout if file is None else file
-    headings, *lines = _format_cells(report, shown)
+    headings, *lines = _format_cells(report)
     table = Table(show_lines=False, title_justify="left")
     for i, heading in enumerate(headings):
         table.add_column(escape(heading), justify="left" if i < 2 else "right", overflow="fold")
@@ -65,18 +50,18 @@ def print_table(report: Report, shown: Shown, file: TextIO | None = None) -> Non
         console.print(note, markup=False, soft_wrap=True)
 
 
-def as_markdown(report: Report, shown: Shown) -> str:
+def as_markdown(report: Report) -> str:
     """A table in Markdown, and below it a list of notes."""
-    headings, *rows = [[_escape_markdown(cell) for cell in line] for line in _format_cells(report, shown)]
+    headings, *rows = [[_escape_markdown(cell) for cell in line] for line in _format_cells(report)]
     aligned = ["---" if i < 2 else "---:" for i in range(len(headings))]
     table = [f"| {' | '.join(row)} |" for row in (headings, aligned, *rows)]
     return "\n".join([*table, "", *(f"- {_escape_markdown(note)}" for note in _list_notes(report))])
 
 
-def as_latex(report: Report, shown: Shown) -> str:
+def as_latex(report: Report) -> str:
     """A `tabular` for the package booktabs, and below it the notes in small print."""
-    headings, *lines = [" & ".join(map(_escape_latex, line)) + r" \\" for line in _format_cells(report, shown)]
-    columns = len(_list_headings(report, shown))
+    headings, *lines = [" & ".join(map(_escape_latex, line)) + r" \\" for line in _format_cells(report)]
+    columns = len(_list_headings(report))
     out = ["% \\usepackage{booktabs}", f"\\begin{{tabular}}{{ll{'r' * (columns - 2)}}}", "\\toprule", headings]
     kind = None
     for row, line in zip(report.rows, lines, strict=True):
@@ -101,25 +86,26 @@ def _list_notes(report: Report) -> list[str]:
     return [*about, *notes, *(f"{MARK} {footnote}" for footnote in report.footnotes)]
 
 
-def _list_headings(report: Report, shown: Shown) -> list[str]:
-    headings = ["system", "features", *report.scenes, *report.means, *(["skill m / deg"] if shown.skill else [])]
-    return headings + ([cost.heading for cost in COSTS.values()] if shown.costs else [])
+def _list_headings(report: Report) -> list[str]:
+    skill = ["skill m / deg"] if "skill" in report.further else []
+    costs = [cost.heading for cost in COSTS.values()] if "costs" in report.further else []
+    return ["system", "features", *report.scenes, *report.means, *skill, *costs]
 
 
-def _format_cells(report: Report, shown: Shown) -> list[list[str]]:
+def _format_cells(report: Report) -> list[list[str]]:
     """Headings, and the cells of each row."""
     columns = dict.fromkeys(report.scenes, 1) | {mean: len(over) for mean, over in report.means.items()}
     best = {column: _find_best(report, column, scenes) for column, scenes in columns.items()}
-    lines = [_list_headings(report, shown)]
+    lines = [_list_headings(report)]
     for row in report.rows:
         line = [row.system + (f" {MARK}" if row.kind == "published" else ""), row.features]
         for column, scenes in columns.items():
             line.append(_format_cell(_get_cell(row, column), scenes, best[column] if row.kind == "own" else ("", "")))
         averages = row.average_costs()
-        if shown.skill:
+        if "skill" in report.further:
             skill = [SKILLS[name].format(averages[name]) if name in averages else "" for name in SKILLS]
             line.append(" / ".join(skill) if any(skill) else "")
-        if shown.costs:
+        if "costs" in report.further:
             line += [cost.format(averages[name]) if name in averages else "" for name, cost in COSTS.items()]
         lines.append(line)
     return lines

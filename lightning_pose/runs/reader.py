@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from mlflow import MlflowClient
     from mlflow.store.entities import PagedList
 
-__all__ = ["Run", "masked", "read_client_runs", "read_runs"]
+__all__ = ["Run", "mask_passwords", "read_client_runs", "read_runs"]
 
 Item = TypeVar("Item")
 Query = Callable[[str], Iterable[Any]]
@@ -73,18 +73,21 @@ class Run:
 
     @cached_property
     def settings(self) -> Mapping[str, str]:
-        """Tags and parameters by name, and what older runs did not say but follows from these."""
-        told = {**self.params, **{name: value for name, value in self.tags.items() if not name.startswith("mlflow.")}}
-        if "task" not in told and "data.class_path" in told:
-            told["task"] = "relative" if "data.clip_length" in told else "absolute"
-        if told.get("task") == "relative":
+        """Tags and parameters by name, and what older runs did not record but follows from these."""
+        settings = {
+            **self.params,
+            **{name: value for name, value in self.tags.items() if not name.startswith("mlflow.")},
+        }
+        if "task" not in settings and "data.class_path" in settings:
+            settings["task"] = "relative" if "data.clip_length" in settings else "absolute"
+        if settings.get("task") == "relative":
             for name in ("clip_length", "stride", "relative_frame"):
-                if f"data.{name}" in told:
-                    told.setdefault(name, told[f"data.{name}"])
+                if f"data.{name}" in settings:
+                    settings.setdefault(name, settings[f"data.{name}"])
         for alias, name in ALIASES.items():
-            if name in told:
-                told.setdefault(alias, told[name])
-        return told
+            if name in settings:
+                settings.setdefault(alias, settings[name])
+        return settings
 
     @property
     def system(self) -> str:
@@ -118,7 +121,7 @@ def read_runs(uri: str) -> list[Run]:
     Raises:
         ConfigError: there is no such store, it cannot be read, it is not MLflow's, or it has no such run.
     """
-    states = ""
+    address, states = mask_passwords(uri), ""
     if uri.startswith(("http://", "https://")):
         runs = _read_server(uri)
     elif re.match(r"\w+(\+\w+)?://", uri) and not uri.startswith("file:"):
@@ -127,18 +130,18 @@ def read_runs(uri: str) -> list[Run]:
             states = "" if runs else f" (runs: {_count_states(query)})"
     else:
         raise ConfigError(
-            f"the tracking store {masked(uri)} is no database and no server; give --tracking_uri sqlite:///FILE, "
+            f"the tracking store {address} is no database and no server; give --tracking_uri sqlite:///FILE, "
             "another database's URL, or the http address of an MLflow server"
         )
     if not runs:
         raise ConfigError(
-            f"{masked(uri)} has no finished run of fit or test{states}; "
+            f"{address} has no finished run of fit or test{states}; "
             "train with `python -m lightning_pose fit --config configs/quickstart.yaml`"
         )
     return sorted(runs, key=lambda run: (run.started, run.run_id), reverse=True)
 
 
-def masked(text: str) -> str:
+def mask_passwords(text: str) -> str:
     """A store's address, or a text with addresses in it, without passwords."""
     return re.sub(r"(://[^:/@\s]*):\S*@", r"\1:***@", text)
 
@@ -146,12 +149,18 @@ def masked(text: str) -> str:
 @contextmanager
 def _open_database(uri: str) -> Iterator[Query]:
     """A function that runs one SQL query; what the database refuses is raised as a `ConfigError`."""
+    address = mask_passwords(uri)
     errors: tuple[type[Exception], ...] = (sqlite3.Error, ImportError)
     try:
         if uri.startswith("sqlite:"):
+            file = Path(uri.removeprefix("sqlite:///").partition("?")[0])
+            if not uri.startswith("sqlite:///") or not file.is_file():
+                raise ConfigError(
+                    f"{address} does not exist; train with `python -m lightning_pose fit`, or say where the runs are "
+                    "with --tracking_uri sqlite:///FILE or MLFLOW_TRACKING_URI"
+                )
             # Read-only, so that nothing is made or changed; a run that is writing is waited for.
-            address = f"{_find_file(uri).resolve().as_uri()}?mode=ro"
-            with closing(sqlite3.connect(address, uri=True, timeout=30)) as connection:
+            with closing(sqlite3.connect(f"{file.resolve().as_uri()}?mode=ro", uri=True, timeout=30)) as connection:
                 connection.execute("BEGIN")
                 yield connection.execute
         else:
@@ -165,21 +174,11 @@ def _open_database(uri: str) -> Iterator[Query]:
             with create_engine(driven).connect() as connection:
                 yield lambda sql: connection.execute(text(sql)).fetchall()
     except errors as error:
-        reason = " ".join(str(getattr(error, "orig", None) or error).split())
+        reason = mask_passwords(" ".join(str(getattr(error, "orig", None) or error).split()))
         raise ConfigError(
-            f"{masked(uri)} cannot be read as an MLflow database ({masked(reason)}); check --tracking_uri: it "
+            f"{address} cannot be read as an MLflow database ({reason}); check --tracking_uri: it "
             "takes the one that MLflow writes, such as sqlite:///mlruns/mlflow.db"
         ) from error
-
-
-def _find_file(uri: str) -> Path:
-    file = Path(uri.removeprefix("sqlite:///").partition("?")[0])
-    if not uri.startswith("sqlite:///") or not file.is_file():
-        raise ConfigError(
-            f"{masked(uri)} does not exist; train with `python -m lightning_pose fit`, or say where the runs are with "
-            "--tracking_uri sqlite:///FILE or MLFLOW_TRACKING_URI"
-        )
-    return file
 
 
 def _read_tables(query: Query) -> list[Run]:
@@ -224,8 +223,8 @@ def _read_server(uri: str) -> list[Run]:
     try:
         return read_client_runs(MlflowClient(uri))
     except MlflowException as error:
-        reason = str(error).partition("\n")[0]
-        raise ConfigError(f"{masked(uri)} does not answer ({masked(reason)}); check --tracking_uri") from error
+        address, reason = mask_passwords(uri), mask_passwords(str(error).partition("\n")[0])
+        raise ConfigError(f"{address} does not answer ({reason}); check --tracking_uri") from error
 
 
 def read_client_runs(client: MlflowClient, page: int = 1000) -> list[Run]:

@@ -36,8 +36,7 @@ def test_the_rule_tells_how_many_runs_know_only_their_last_epoch(table) -> None:
     runs = [FakeRun(metrics=known), FakeRun(val=0.2), FakeRun(scene="fire", val=0.3)]
     says = "the run that is best by val/position_median_m of its best epoch"
     assert table(*runs).rule == (
-        f"of each system and scene, {says} (of its last, for 2 of 3 runs that do not tell their best); "
-        "never by test errors"
+        f"of each system and scene, {says} (of its last, for 2 of 3 runs that do not record their best); never by test errors"
     )
     assert table(runs[0]).rule == f"of each system and scene, {says}; never by test errors"
 
@@ -116,5 +115,5 @@ def test_spread_refuses_runs_that_differ_in_more_than_the_seed(table) -> None:
     with pytest.raises(ConfigError, match=r"2 runs differ in model.units \(1, 2\), .* give --by model.units "):
         table(*runs, pick="spread")
     assert list(shown(table(*runs, pick="spread", by=("model.units",)))) == ["SurfLSTM (units=1)", "SurfLSTM (units=2)"]
-    with pytest.raises(ConfigError, match="1 runs of `test`, which do not know the seed"):
+    with pytest.raises(ConfigError, match="1 runs of `test`, which do not have the seed"):
         table(FakeRun(tags={"verb": "test"}), pick="spread")

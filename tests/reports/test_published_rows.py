@@ -233,7 +233,7 @@ def test_published_clips_are_of_scenes_that_were_not_seen() -> None:
     [
         ({"test_frames": "150"}, "do not compare: redkitchen is a cut, 150 test frames of 5000"),
         ({"split": "blocks"}, "do not compare: redkitchen has its own split (blocks)"),
-        ({}, "do not compare: redkitchen may be a cut, no run tells how many of the 5000 test frames it has"),
+        ({}, "do not compare: redkitchen may be a cut, no run records how many of the 5000 test frames it has"),
         ({"test_frames": "5000"}, "published rows are of the same official test frames"),
     ],
 )

@@ -35,7 +35,7 @@ def test_rows_by_settings_in_the_order_of_numbers(table) -> None:
         "SurfLSTM (features=surf)",
     ]
     assert report.rows[1].settings == {"model.neighbours": "20", "features": "surf"}
-    with pytest.raises(ConfigError, match=r"no run tells 'neighbors', .* did you mean model.neighbours\?"):
+    with pytest.raises(ConfigError, match=r"no run has 'neighbors', .* did you mean model.neighbours\?"):
         table(*runs, by=("neighbors",))
 
 
@@ -78,8 +78,8 @@ def test_clips_of_another_length_do_not_mix(table) -> None:
 def test_what_old_runs_do_not_tell_is_told(table) -> None:
     old = FakeRun("SurfLSTM", tags={"image_size": None, "split": None})
     report = table(old, FakeRun("NodePose", tags={"test_frames": "150"}))
-    (note,) = [note for note in report.notes if "do not tell" in note]
-    assert note == "1 of 2 runs do not tell split, image size, test frames: taken to match the others, not checked"
+    (note,) = [note for note in report.notes if "do not record" in note]
+    assert note == "1 of 2 runs do not record split, image size, test frames: taken to match the others, not checked"
     assert report.captions == ["chess: absolute poses, official split, original ground truth, images 640x480, "
                                "150 test frames"]  # fmt: skip
 

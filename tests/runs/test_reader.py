@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from lightning_pose.errors import ConfigError
-from lightning_pose.runs.reader import Run, masked, read_client_runs, read_runs
+from lightning_pose.runs.reader import Run, mask_passwords, read_client_runs, read_runs
 from tests.stores import FakeRun, make_store
 
 
@@ -107,7 +107,7 @@ def test_an_unreachable_database_keeps_its_password() -> None:
     ) as info:
         read_runs(uri)
     assert "secret" not in str(info.value)
-    assert masked("sqlite:///a.db") == "sqlite:///a.db"
+    assert mask_passwords("sqlite:///a.db") == "sqlite:///a.db"
 
 
 @pytest.mark.parametrize(
@@ -133,5 +133,5 @@ def test_an_empty_server_keeps_its_password(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_passwords_are_masked_to_their_end() -> None:
-    assert masked("http://ada:s@cr/t@host:5000/x") == "http://ada:***@host:5000/x"
-    assert masked("see http://host:5000/a and mail@host") == "see http://host:5000/a and mail@host"
+    assert mask_passwords("http://ada:s@cr/t@host:5000/x") == "http://ada:***@host:5000/x"
+    assert mask_passwords("see http://host:5000/a and mail@host") == "see http://host:5000/a and mail@host"
