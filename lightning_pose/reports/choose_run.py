@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from lightning_pose.errors import ConfigError
+from lightning_pose.metrics.catalog import MEDIANS
 from lightning_pose.reports.comparability import FOLDERS, differing_settings, same_data
 from lightning_pose.runs.reader import Run
 
@@ -16,7 +17,7 @@ __all__ = ["PICKS", "Choice", "Pick", "pick_runs"]
 
 Pick = Literal["best", "latest", "spread"]
 PICKS: tuple[Pick, ...] = ("best", "latest", "spread")
-VALIDATION = ("val/position_median_m", "val/loss")
+VALIDATION = (f"val/{MEDIANS[0]}", "val/loss")
 """Of a run's best epoch, `best/...`, or of its last where that is missing."""
 
 UNMEASURED = "no validation metric, so the newest run is shown"

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 
 from lightning_pose.errors import ConfigError
+from lightning_pose.metrics.catalog import MEDIANS
 from lightning_pose.runs.reader import Run
 
 __all__ = ["Filters", "check_setting", "read_date", "select_runs"]
@@ -58,7 +59,7 @@ def select_runs(runs: Sequence[Run], filters: Filters) -> tuple[list[Run], list[
         wanted = [value for other, value in filters.tags if other == name]
         kept = _keep_values(kept, f"--tag {name}=", wanted, lambda run, name=name: run.settings.get(name))
     kept = _keep_dates(kept, filters.since, filters.until)
-    tested = [run for run in kept if "test/position_median_m" in run.metrics]
+    tested = [run for run in kept if f"test/{MEDIANS[0]}" in run.metrics]
     if not tested:
         trials = " (trials of a sweep never see test frames)" if any(run.trial for run in kept) else ""
         raise ConfigError(

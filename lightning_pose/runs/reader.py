@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from lightning_pose.errors import ConfigError
+from lightning_pose.metrics.catalog import MEDIANS, SKILLS
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -30,7 +31,7 @@ Item = TypeVar("Item")
 Query = Callable[[str], Iterable[Any]]
 
 METRICS = re.compile(
-    r"(test|(best/)?val|baseline/\w+)/(position_median_m|orientation_median_deg)|(best/)?val/loss|test/skill_\w+|cost/\w+"
+    rf"(test|(best/)?val|baseline/\w+)/({'|'.join(MEDIANS)})|(best/)?val/loss|test/({'|'.join(SKILLS)})|cost/\w+"
 )
 """The metrics that a report reads; a run has a hundred others."""
 

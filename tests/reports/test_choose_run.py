@@ -36,7 +36,8 @@ def test_the_rule_tells_how_many_runs_know_only_their_last_epoch(table) -> None:
     runs = [FakeRun(metrics=known), FakeRun(val=0.2), FakeRun(scene="fire", val=0.3)]
     says = "the run that is best by val/position_median_m of its best epoch"
     assert table(*runs).rule == (
-        f"of each system and scene, {says} (of its last, for 2 of 3 runs that do not record their best); never by test errors"
+        f"of each system and scene, {says} (of its last, for 2 of 3 runs that do not record their best); "
+        "never by test errors"
     )
     assert table(runs[0]).rule == f"of each system and scene, {says}; never by test errors"
 
