@@ -33,6 +33,7 @@ class Metric(NamedTuple):
         within: metres and degrees of a recall, None for any other metric.
         printed: whether the table that a test prints has a column of it.
         described: whether the run's description in MLflow has one too.
+        objective: whether the trials of a sweep measure it without test frames, so that they may be chosen by it.
     """
 
     title: str
@@ -43,6 +44,7 @@ class Metric(NamedTuple):
     within: tuple[float, float] | None = None
     printed: bool = True
     described: bool = False
+    objective: bool = True
 
     @property
     def label(self) -> str:
@@ -115,7 +117,7 @@ COSTS = {
     "ms_per_frame": Metric("network time per frame", "ms", "ms / frame"),
     "features_ms_per_frame": Metric("feature time per frame", "ms", "features ms / frame"),
     "frame_bytes": Metric("size of a frame's features", "bytes", "frame bytes"),
-    "checkpoint_bytes": Metric("size of the checkpoint", "bytes", "checkpoint"),
+    "checkpoint_bytes": Metric("size of the checkpoint", "bytes", "checkpoint", objective=False),
 }
 """What a localizer costs: `cost/NAME`."""
 

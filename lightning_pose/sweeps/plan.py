@@ -17,7 +17,7 @@ from lightning_pose.sweeps.space import BASE, MEASURES, Parameter, by_class_path
 __all__ = ["MEASURES", "Objective", "Plan", "read_plan"]
 
 FIELDS = ("base", "objective", "sampler", "pruner", "n_trials", "seed", "settings", "space", "measure", "figure")
-COSTS = tuple(f"cost/{name}" for name in catalog.COSTS)
+COSTS = tuple(f"cost/{name}" for name, cost in catalog.COSTS.items() if cost.objective)
 MEASURED = ("val/loss", *(f"val/{name}" for name in catalog.ERRORS))
 SCENES = ("data.root", "data.train_scenes", "data.test_scenes", "data.room_seed", "data.train_rooms", "data.test_rooms")
 FEATURES = ("features/count_median", "features/count_mean")

@@ -6,9 +6,12 @@ import subprocess
 import sys
 
 import pytest
+import yaml
 
+from lightning_pose.errors import ConfigError
 from lightning_pose.metrics import catalog
-from tests.helpers import Trained
+from lightning_pose.sweeps.plan import read_plan
+from tests.helpers import Trained, Workplace
 from tests.test_clip_cli import clip_run
 
 __all__ = ["clip_run"]
@@ -75,6 +78,24 @@ def test_recalls_alone_are_better_when_higher() -> None:
     assert {name for name, metric in catalog.ERRORS.items() if metric.higher_is_better} == {
         name for name in catalog.ERRORS if name.startswith("recall")
     }
+
+
+@pytest.mark.parametrize(
+    ("metric", "maximize"), [("val/recall_5cm_5deg", True), ("val/position_p95_m", False), ("cost/frame_bytes", False)]
+)
+def test_sweeps_take_the_direction_of_a_metric(metric: str, maximize: bool, workplace: Workplace) -> None:
+    file = workplace.folder / "sweep.yaml"
+    file.write_text(yaml.safe_dump({"base": "tiny.yaml", "space": {"model.units": [4, 8]}, "objective": metric}))
+    (objective,) = read_plan(file, {}).objectives
+    assert (objective.metric, objective.maximize) == (metric, maximize)
+
+
+def test_what_trials_do_not_measure_is_no_objective(workplace: Workplace) -> None:
+    file = workplace.folder / "sweep.yaml"
+    entries = {"base": "tiny.yaml", "space": {"model.units": [4, 8]}, "objective": "cost/checkpoint_bytes"}
+    file.write_text(yaml.safe_dump(entries))
+    with pytest.raises(ConfigError, match="objective cost/checkpoint_bytes is not known"):
+        read_plan(file, {})
 
 
 def test_importing_it_loads_no_library() -> None:
