@@ -8,7 +8,7 @@ import sys
 from typing import TextIO
 
 from lightning_pose.metrics.catalog import COSTS, ERRORS, MEDIANS, SKILLS
-from lightning_pose.reports.table import Cell, Report, Row
+from lightning_pose.reports.table import Cell, Report
 
 __all__ = ["as_latex", "as_markdown", "print_table"]
 
@@ -36,7 +36,7 @@ def print_table(report: Report, file: TextIO | None = None) -> None:
     from rich.table import Table
 
     stream: TextIO = sys.stdout if file is None else file
-    headings, *lines = _format_cells(report)
+    headings, *lines = _format_table(report)
     table = Table(show_lines=False, title_justify="left")
     for i, heading in enumerate(headings):
         table.add_column(escape(heading), justify="left" if i < 2 else "right", overflow="fold")
@@ -52,7 +52,7 @@ def print_table(report: Report, file: TextIO | None = None) -> None:
 
 def as_markdown(report: Report) -> str:
     """A table in Markdown, and below it a list of notes."""
-    headings, *rows = [[_escape_markdown(cell) for cell in line] for line in _format_cells(report)]
+    headings, *rows = [[_escape_markdown(cell) for cell in line] for line in _format_table(report)]
     aligned = ["---" if i < 2 else "---:" for i in range(len(headings))]
     table = [f"| {' | '.join(row)} |" for row in (headings, aligned, *rows)]
     return "\n".join([*table, "", *(f"- {_escape_markdown(note)}" for note in _list_notes(report))])
@@ -60,13 +60,11 @@ def as_markdown(report: Report) -> str:
 
 def as_latex(report: Report) -> str:
     """A `tabular` for the package booktabs, and below it the notes in small print."""
-    headings, *lines = [" & ".join(map(_escape_latex, line)) + r" \\" for line in _format_cells(report)]
-    columns = len(_list_headings(report))
-    out = ["% \\usepackage{booktabs}", f"\\begin{{tabular}}{{ll{'r' * (columns - 2)}}}", "\\toprule", headings]
-    kind = None
-    for row, line in zip(report.rows, lines, strict=True):
-        out += [line] if row.kind == kind else ["\\midrule", line]
-        kind = row.kind
+    table = _format_table(report)
+    headings, *lines = [" & ".join(map(_escape_latex, line)) + r" \\" for line in table]
+    out = ["% \\usepackage{booktabs}", f"\\begin{{tabular}}{{ll{'r' * (len(table[0]) - 2)}}}", "\\toprule", headings]
+    for i, (row, line) in enumerate(zip(report.rows, lines, strict=True)):
+        out += [line] if i and report.rows[i - 1].kind == row.kind else ["\\midrule", line]
     out += ["\\bottomrule", "\\end{tabular}", "\\par\\smallskip", "{\\footnotesize\\raggedright"]
     return "\n".join([*out, *(f"{_escape_latex(note)}\\par" for note in _list_notes(report)), "}"])
 
@@ -86,45 +84,40 @@ def _list_notes(report: Report) -> list[str]:
     return [*about, *notes, *(f"{MARK} {footnote}" for footnote in report.footnotes)]
 
 
-def _list_headings(report: Report) -> list[str]:
-    skill = ["skill m / deg"] if "skill" in report.further else []
-    costs = [cost.heading for cost in COSTS.values()] if "costs" in report.further else []
-    return ["system", "features", *report.scenes, *report.means, *skill, *costs]
-
-
-def _format_cells(report: Report) -> list[list[str]]:
+def _format_table(report: Report) -> list[list[str]]:
     """Headings, and the cells of each row."""
-    columns = dict.fromkeys(report.scenes, 1) | {mean: len(over) for mean, over in report.means.items()}
-    best = {column: _find_best(report, column, scenes) for column, scenes in columns.items()}
-    lines = [_list_headings(report)]
-    for row in report.rows:
-        line = [row.system + (f" {MARK}" if row.kind == "published" else ""), row.features]
-        for column, scenes in columns.items():
-            line.append(_format_cell(_get_cell(row, column), scenes, best[column] if row.kind == "own" else ("", "")))
+    headings = ["system", "features", *report.scenes, *report.means]
+    headings += ["skill m / deg"] if "skill" in report.further else []
+    headings += [cost.heading for cost in COSTS.values()] if "costs" in report.further else []
+    sizes = [1] * len(report.scenes) + [len(scenes) for scenes in report.means.values()]
+    cells = [[*map(row.cells.get, report.scenes), *map(row.means.get, report.means)] for row in report.rows]
+    own = [line for row, line in zip(report.rows, cells, strict=True) if row.kind == "own"]
+    best = [_find_best([line[i] for line in own], size) for i, size in enumerate(sizes)]
+    lines = [headings]
+    for row, line in zip(report.rows, cells, strict=True):
+        marked = best if row.kind == "own" else [("", "")] * len(sizes)
         averages = row.average_costs()
+        texts = [row.system + (f" {MARK}" if row.kind == "published" else ""), row.features]
+        texts += map(_format_cell, line, sizes, marked)
         if "skill" in report.further:
             skill = [SKILLS[name].format(averages[name]) if name in averages else "" for name in SKILLS]
-            line.append(" / ".join(skill) if any(skill) else "")
+            texts.append(" / ".join(skill) if any(skill) else "")
         if "costs" in report.further:
-            line += [cost.format(averages[name]) if name in averages else "" for name, cost in COSTS.items()]
-        lines.append(line)
+            texts += [cost.format(averages[name]) if name in averages else "" for name, cost in COSTS.items()]
+        lines.append(texts)
     return lines
 
 
-def _get_cell(row: Row, column: str) -> Cell | None:
-    return row.cells.get(column) or row.means.get(column)
-
-
-def _format_cell(cell: Cell | None, scenes: int, best: tuple[str, str]) -> str:
+def _format_cell(cell: Cell | None, size: int, best: tuple[str, str]) -> str:
     """Both errors, bold where they are the best of a column of means over so many scenes, and what they are over."""
     if cell is None:
         return ABSENT
     parts = []
     for i, text in enumerate(_format_errors(cell)):
         spread = f" ± {ERRORS[MEDIANS[i]].format(cell.deviations[i])}" if cell.deviations else ""
-        parts.append(f"{BOLD}{text}{spread}{END}" if text == best[i] and cell.scenes == scenes else text + spread)
-    over = f" (n={len(cell.runs)})" if len(cell.runs) > 1 else f" [{cell.scenes} of {scenes}]"
-    return " / ".join(parts) + (over if len(cell.runs) > 1 or cell.scenes != scenes else "")
+        parts.append(f"{BOLD}{text}{spread}{END}" if text == best[i] and cell.scenes == size else text + spread)
+    over = f" (n={len(cell.runs)})" if len(cell.runs) > 1 else f" [{cell.scenes} of {size}]"
+    return " / ".join(parts) + (over if len(cell.runs) > 1 or cell.scenes != size else "")
 
 
 def _format_errors(cell: Cell) -> tuple[str, str]:
@@ -138,10 +131,9 @@ def _format_errors(cell: Cell) -> tuple[str, str]:
     return position, orientation
 
 
-def _find_best(report: Report, column: str, scenes: int) -> tuple[str, str]:
-    """The user's lowest errors in a column, as they are shown; empty where there are no two systems to compare."""
-    cells = [cell for row in report.rows if row.kind == "own" and (cell := _get_cell(row, column))]
-    cells = [cell for cell in cells if cell.scenes == scenes]
+def _find_best(column: list[Cell | None], size: int) -> tuple[str, str]:
+    """The lowest errors of a column of means over so many scenes, as they are shown; empty where there are no two."""
+    cells = [cell for cell in column if cell and cell.scenes == size]
     if len(cells) < 2:
         return "", ""
     nearest = min(cells, key=lambda cell: _sort_error(cell.errors[0]))

@@ -73,8 +73,8 @@ def test_spread_over_seeds(table) -> None:
 
 def test_spread_takes_the_newest_of_each_seed_and_no_test_runs(table) -> None:
     report = table(
-        FakeRun(test=(9.0, 1.0), params={"seed": "0"}, day=1),
-        FakeRun(test=(0.1, 1.0), params={"seed": "0", "data.workers": "4"}, day=2),
+        FakeRun(test=(9.0, 1.0), params={"seed": "0", "data.eval_batch_size": "64"}, day=1),
+        FakeRun(test=(0.1, 1.0), params={"seed": "0", "data.workers": "4", "data.eval_batch_size": "8"}, day=2),
         FakeRun(test=(0.3, 1.0), params={"seed": "1"}, day=2),
         FakeRun(test=(9.0, 1.0), params={"seed": "2"}, tags={"verb": "test"}, day=2),
         pick="spread",

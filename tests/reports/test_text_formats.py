@@ -44,3 +44,8 @@ def test_a_column_for_the_mean_of_each_dataset(table) -> None:
         "| SurfLSTM | surf | **0.100** / 8.00 | 0.300 / 6.00 | 2.000 / **3.00** | 0.200 / 7.00 | 2.000 / **3.00** |",
     ]
     assert r"\begin{tabular}{llrrrrr}" in as_latex(report)
+
+
+def test_a_scene_may_have_the_name_of_a_column(table) -> None:
+    report = table(FakeRun(scene="mean", test=(0.1, 8.0)), FakeRun(scene="den", test=(0.3, 6.0)))
+    assert as_markdown(report).splitlines()[2] == "| SurfLSTM | surf | 0.300 / 6.00 | 0.100 / 8.00 | 0.200 / 7.00 |"
