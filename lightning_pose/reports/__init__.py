@@ -1,1 +1,1 @@
-"""Reports: `filters` select runs, `comparability` refuses mixtures, `table` joins runs, `*_rows` add rows to compare."""
+"""Reports: `filters` select runs, `comparability` refuses mixtures, `table` joins runs, `*_rows` add reference rows."""

@@ -7,7 +7,6 @@ import io
 import json
 import math
 from collections.abc import Iterator, Mapping
-from typing import Any
 
 from lightning_pose.metrics.catalog import COSTS, MEDIANS, SKILLS
 from lightning_pose.reports.table import STANDARD_DEVIATIONS, Cell, Report, Row
@@ -37,7 +36,7 @@ def as_csv(report: Report) -> str:
     return out.getvalue().rstrip("\n")
 
 
-def _list_lines(row: Row, report: Report) -> Iterator[dict[str, Any]]:
+def _list_lines(row: Row, report: Report) -> Iterator[dict[str, object]]:
     """The cells of a row, and then its means: errors, skill, costs, and the facts that the scenes share."""
     for (column, cell), is_mean in [*((c, False) for c in row.cells.items()), *((m, True) for m in row.means.items())]:
         scenes = report.means[column] if is_mean else [column]
@@ -65,7 +64,7 @@ def as_json(report: Report) -> str:
     return json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False)
 
 
-def _row_document(row: Row) -> dict[str, Any]:
+def _row_document(row: Row) -> dict[str, object]:
     averages = _replace_infinite(row.average_costs())
     return {
         "kind": row.kind,
@@ -83,7 +82,7 @@ def _row_document(row: Row) -> dict[str, Any]:
     }
 
 
-def _cell_document(cell: Cell) -> dict[str, Any]:
+def _cell_document(cell: Cell) -> dict[str, object]:
     runs = [
         {
             "run_id": run.run_id,

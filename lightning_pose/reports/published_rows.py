@@ -18,13 +18,13 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from importlib.resources import files
 
 from lightning_pose.reports.comparability import find_tested_fact
 from lightning_pose.reports.table import Cell, Report, Row, add_means
 
-__all__ = ["CHAPTERS", "FRAMES", "SCENES", "Published", "add_published", "published_systems"]
+__all__ = ["CHAPTERS", "FRAMES", "SCENES", "add_published", "read_published"]
 
 CHAPTERS = (2, 3, 4, 5, 6)
 SOURCE = (
@@ -49,36 +49,21 @@ FRAMES = {line["name"]: int(line["test_frames"]) for line in _read_csv("publishe
 """Test frames of the official splits."""
 
 
-@dataclass(frozen=True)
-class Published:
-    """A row of a published table.
-
-    Attributes:
-        system: as the table names it.
-        table: number of the table.
-        task: `absolute`, or `relative` for poses within clips.
-        cells: by scene, in the names that `SCENES` gives.
-    """
-
-    system: str
-    table: str
-    task: str
-    cells: dict[str, Cell] = field(default_factory=dict)
-
-
-def published_systems(chapters: Iterable[int] = CHAPTERS) -> list[Published]:
+def read_published(chapters: Iterable[int] = CHAPTERS) -> dict[tuple[str, str, str], dict[str, Cell]]:
     """The rows of the thesis's tables 2.3, 3.2, 4.1, 5.2 and 6.1.
 
     Args:
         chapters: whose tables.
+
+    Returns:
+        (number of the table, system as the table names it, task) to cells by scene, in the names that `SCENES` gives.
     """
-    systems: dict[tuple[str, str], Published] = {}
+    rows: dict[tuple[str, str, str], dict[str, Cell]] = {}
     for line in _read_csv("published_rows"):
         if line["kind"] == "cell" and int(line["chapter"]) in chapters:
-            published = Published(line["system"], line["table"], line["task"])
-            published = systems.setdefault((published.table, published.system), published)
-            published.cells[line["scene"]] = _published_cell(line)
-    return list(systems.values())
+            row = rows.setdefault((line["table"], line["system"], line["task"]), {})
+            row[line["scene"]] = _published_cell(line)
+    return rows
 
 
 def add_published(report: Report, chapters: Sequence[int] = ()) -> None:
@@ -98,15 +83,18 @@ def add_published(report: Report, chapters: Sequence[int] = ()) -> None:
     rows: dict[tuple[object, ...], Row] = {}
     tables: set[str] = set()
     left_out: set[str] = set()
-    for published in published_systems(chapters or CHAPTERS):
-        shared = {scene: name for scene, name in columns.items() if name in published.cells}
-        alike = [scene for scene in shared if report.facts[scene].get("task", published.task) == published.task]
+    for (table, system, task), cells in read_published(chapters or CHAPTERS).items():
+        shared = {scene: cells[name] for scene, name in columns.items() if name in cells}
+        alike = {scene: shared[scene] for scene in shared if report.facts[scene].get("task", task) == task}
         if len(alike) < len(shared):
-            left_out.add(published.task)
+            left_out.add(task)
         if alike:
-            cells = {scene: published.cells[shared[scene]] for scene in alike}
-            tables.add(published.table)
-            _add_row(rows, published, cells)
+            # Tables that agree in all the cells on show share a row.
+            key = system, *((scene, cell.errors) for scene, cell in alike.items())
+            row = rows.setdefault(key, Row("published", system, "", alike))
+            row.source += f", {table}" if row.source else f"table {table}"
+            row.features = row.source
+            tables.add(table)
     add_means(report, list(rows.values()))
     means = [] if chapters else _mean_rows(report, columns)
     report.rows += [*rows.values(), *means]
@@ -128,14 +116,6 @@ def _published_name(report: Report, scene: str) -> str | None:
     if truth is None or (find_tested_fact(scene, facts, "ground_truth") or truth) != truth:
         return None
     return SCENES.get(re.sub("[ _-]", "", scene.rpartition(" to ")[2].lower()))
-
-
-def _add_row(rows: dict[tuple[object, ...], Row], published: Published, cells: dict[str, Cell]) -> None:
-    """Add a row, or the table's number to the row of another table that agrees in all the cells on show."""
-    key = published.system, *((scene, cell.errors) for scene, cell in cells.items())
-    row = rows.setdefault(key, Row("published", published.system, "", cells))
-    row.source += f", {published.table}" if row.source else f"table {published.table}"
-    row.features = row.source
 
 
 def _mean_rows(report: Report, columns: dict[str, str]) -> list[Row]:

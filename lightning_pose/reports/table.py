@@ -169,10 +169,8 @@ def build_report(runs: Sequence[Run], pick: Pick = "best", by: Sequence[str] = (
     rows = []
     for key in sorted(groups, key=lambda key: [_sort_number(part) for part in key]):
         settings = dict(zip(by, key[1:], strict=True))
-        cells = {scene: [run for run in groups[key] if run.scene == scene] for scene in scenes}
-        rows.append(
-            _build_row(key[0], settings, {scene: found for scene, found in cells.items() if found}, pick, choice)
-        )
+        by_scene = {scene: [run for run in groups[key] if run.scene == scene] for scene in scenes}
+        rows.append(_build_row(key[0], settings, by_scene, pick, choice))
     report = Report(scenes, facts, rows, choice.describe_rule(pick), choice.all_notes())
     add_means(report, rows)
     return report
