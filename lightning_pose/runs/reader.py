@@ -44,8 +44,7 @@ _FINISHED = """FROM runs r JOIN experiments e ON e.experiment_id = r.experiment_
 JOIN tags v ON v.run_uuid = r.run_uuid AND v.key = 'verb' AND v.value IN ('fit', 'test') {join}
 WHERE r.status = 'FINISHED' AND r.lifecycle_stage = 'active' AND e.lifecycle_stage = 'active'"""
 _RUNS = f"SELECT r.run_uuid, r.name, e.name, r.start_time {_FINISHED.format(join='')}"
-_VALUES = "SELECT t.run_uuid, t.key, {column} " + _FINISHED.format(join="JOIN {table} t ON t.run_uuid = r.run_uuid")
-_NUMBER = "CASE WHEN t.is_nan THEN NULL ELSE t.value END"
+_VALUES = "SELECT t.run_uuid, t.key, {columns} " + _FINISHED.format(join="JOIN {table} t ON t.run_uuid = r.run_uuid")
 _STATES = """SELECT v.value, r.status, r.lifecycle_stage FROM runs r
 LEFT JOIN tags v ON v.run_uuid = r.run_uuid AND v.key = 'verb'"""
 
@@ -188,21 +187,19 @@ def _read_tables(query: Query) -> list[Run]:
     params: dict[str, dict[str, str]] = {}
     metrics: dict[str, dict[str, float]] = {}
     for table, values in (("tags", tags), ("params", params)):
-        for run, name, value in query(_VALUES.format(table=table, column="t.value")):
+        for run, name, value in query(_VALUES.format(table=table, columns="t.value")):
             values.setdefault(run, {})[name] = value
-    for run, name, value in query(_VALUES.format(table="latest_metrics", column=_NUMBER)):
+    for run, name, value, is_nan in query(_VALUES.format(table="latest_metrics", columns="t.value, t.is_nan")):
         if METRICS.fullmatch(name):
-            metrics.setdefault(run, {})[name] = _restore_infinity(value)
+            metrics.setdefault(run, {})[name] = math.nan if is_nan else _restore_infinity(value)
     return [
         Run(run, name or "", experiment, started or 0, tags[run], params.get(run, {}), metrics.get(run, {}))
         for run, name, experiment, started in runs
     ]
 
 
-def _restore_infinity(value: float | None) -> float:
-    """The value as it was logged; MLflow keeps infinity as the largest double, and no value for NaN."""
-    if value is None:
-        return math.nan
+def _restore_infinity(value: float) -> float:
+    """The value as it was logged; MLflow keeps infinity as the largest double."""
     return math.copysign(math.inf, value) if abs(value) > LARGEST else float(value)
 
 
