@@ -22,6 +22,7 @@ from lightning_pose.figures import clips as clip_figures
 from lightning_pose.geometry.quaternions import orientation_error_deg, position_error_m, quat_rotate
 from lightning_pose.geometry.relative import absolute_poses, relative_poses
 from lightning_pose.localization.sequences import chain_test_split
+from lightning_pose.metrics.catalog import MEDIANS, reference_baseline
 from lightning_pose.metrics.summary import summarize_errors
 from lightning_pose.metrics.trajectory import drift_by_length, mean_over_sequences, trajectory_errors
 from lightning_pose.models.base import Pose, PoseModule
@@ -33,7 +34,6 @@ LENGTHS = (2, 5, 10, 20, 50, 100, 200, 400)
 """Frames of the clips that errors are measured for, as far as sequences are long enough (thesis, fig. 6.4)."""
 
 _FRAMES = 512  # in a batch, whatever the length of its clips
-_BY_LENGTH = ("position_median_m", "orientation_median_deg")
 
 
 class Sequence(NamedTuple):
@@ -75,9 +75,9 @@ def evaluate_clips(
     curves = {
         f"{_metric_prefix(system, name)}/{metric}_by_length": {n: found[n][system][metric] for n in lengths}
         for system in found[lengths[0]]
-        for metric in _BY_LENGTH
+        for metric in MEDIANS
     }
-    extras = skill(model, baselines["no_motion"]) | costs(trainer, module, datamodule.clip_length)
+    extras = skill(model, baselines[reference_baseline(clips=True)]) | costs(trainer, module, datamodule.clip_length)
     for system, metrics in tracking.items():
         extras |= {f"{_metric_prefix(system, name)}/{metric}": value for metric, value in metrics.items()}
     if odometry:
@@ -206,7 +206,7 @@ def _draw_clip_figures(
     shown = _title_sequences(sequences)
     lengths = list(found)
     errors = {
-        system: ([found[n][system][_BY_LENGTH[0]] for n in lengths], [found[n][system][_BY_LENGTH[1]] for n in lengths])
+        system: ([found[n][system][MEDIANS[0]] for n in lengths], [found[n][system][MEDIANS[1]] for n in lengths])
         for system in found[lengths[0]]
     }
     return {

@@ -15,6 +15,7 @@ from lightning_pose.evaluation.costs import costs
 from lightning_pose.evaluation.result import Evaluation, skill
 from lightning_pose.figures import images as image_figures
 from lightning_pose.geometry.quaternions import orientation_error_deg, position_error_m
+from lightning_pose.metrics.catalog import reference_baseline
 from lightning_pose.models.base import Pose, PoseModule
 from lightning_pose.scenes.scene import Scene
 
@@ -51,7 +52,7 @@ def evaluate_images(
     metrics = {system: result.metrics for system, result in baselines.items()}
     return Evaluation(
         baselines=metrics,
-        extras=skill(model, metrics["retrieval_top1"]) | costs(trainer, module),
+        extras=skill(model, metrics[reference_baseline(clips=False)]) | costs(trainer, module),
         trajectories={"truth": (frames, Pose(test.position_m, test.quat_wxyz)), "predictions": (frames, prediction)},
         figures=_draw_image_figures(scene, name, train, test, poses),
     )

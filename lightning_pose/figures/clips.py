@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 
 from lightning_pose.figures.style import (
     BASELINES,
+    CLIP_BASELINES,
     MODEL,
     OTHERS,
     SMALLEST,
@@ -31,11 +32,6 @@ from lightning_pose.figures.style import (
 
 __all__ = ["draw_error_by_length", "draw_relative_trajectories", "draw_responses"]
 
-CLIP_BASELINES = {
-    "no_motion": ("#8c8c8c", (0, (1, 1.5))),
-    "constant_velocity": ("#D55E00", (0, (5, 1.5))),
-    "visual_odometry": ("#009E73", (0, (5, 1.5, 1, 1.5))),
-}
 PANELS = 9  # three by three: more would be too small to read
 TITLE = 28  # letters above a panel that do not reach into the next one
 COLUMNS = 8  # filters in a row

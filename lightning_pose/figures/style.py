@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,11 +10,14 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from numpy.typing import ArrayLike
 
+from lightning_pose.metrics import catalog
+
 if TYPE_CHECKING:
     from matplotlib.typing import RcKeyType
 
 __all__ = [
     "BASELINES",
+    "CLIP_BASELINES",
     "MODEL",
     "OTHERS",
     "SMALLEST",
@@ -31,14 +35,25 @@ Errors = tuple[ArrayLike, ArrayLike]
 
 MODEL, TRUTH, TRAINING = "#0072B2", "#1a1a1a", "#c4c4c4"
 
-BASELINES = {
-    "train_mean": ("#8c8c8c", (0, (1, 1.5))),
-    "retrieval_top1": ("#D55E00", (0, (5, 1.5))),
-    "retrieval_top5": ("#E69F00", (0, (3, 1.5))),
-    "oracle": ("#009E73", (0, (5, 1.5, 1, 1.5))),
-}
+Look = tuple[str, str | tuple]
+"""Colour and dashes of a line."""
 
-OTHERS = [("#CC79A7", (0, (5, 1.5))), ("#56B4E9", (0, (3, 1.5))), ("#882255", (0, (1, 1)))]
+GRAY_DOTS: Look = ("#8c8c8c", (0, (1, 1.5)))
+RED_DASHES: Look = ("#D55E00", (0, (5, 1.5)))
+ORANGE_DASHES: Look = ("#E69F00", (0, (3, 1.5)))
+GREEN_DASH_DOTS: Look = ("#009E73", (0, (5, 1.5, 1, 1.5)))
+
+
+def assign_looks(clips: bool, looks: Sequence[Look]) -> dict[str, Look]:
+    """The catalogue's baselines of clips or of single images, in its order, each with a look while there are looks."""
+    names = [name for name, baseline in catalog.BASELINES.items() if baseline.clips == clips]
+    return dict(zip(names, looks, strict=False))
+
+
+BASELINES = assign_looks(False, (GRAY_DOTS, RED_DASHES, ORANGE_DASHES, GREEN_DASH_DOTS))
+CLIP_BASELINES = assign_looks(True, (GRAY_DOTS, RED_DASHES, GREEN_DASH_DOTS))
+
+OTHERS: list[Look] = [("#CC79A7", (0, (5, 1.5))), ("#56B4E9", (0, (3, 1.5))), ("#882255", (0, (1, 1)))]
 
 SMALLEST = 1e-4  # metres or degrees, drawn for zero, which a logarithmic axis cannot show
 

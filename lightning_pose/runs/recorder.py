@@ -15,6 +15,7 @@ from lightning_pose.errors import ImageError
 from lightning_pose.models.base import PoseModule
 from lightning_pose.runs.checkpoints import checkpoint_folder, run_logger
 from lightning_pose.runs.logger import MLflowLogger
+from lightning_pose.runs.tags import OPERATIONAL
 from lightning_pose.scenes.images import read_gray
 
 __all__ = ["RunRecorder", "read_train_seconds"]
@@ -99,15 +100,11 @@ def read_train_seconds(trainer: Trainer) -> float | None:
     return (timers[0].time_elapsed("train") or None) if timers else None
 
 
-_NOT_RECORDED = ("cache_dir", "workers", "eval_batch_size")
-"""Settings of the data that do not change the result, and would show as differences where runs are compared."""
-
-
 def _collect_settings(trainer: Trainer, module: PoseModule) -> dict[str, object]:
     """The run's settings, nested, as parameters of the run: `MLflowLogger` flattens them."""
     datamodule = scene_datamodule(trainer)
     data = datamodule.describe()
-    kept = {name: value for name, value in data["init_args"].items() if name not in _NOT_RECORDED}
+    kept = {name: value for name, value in data["init_args"].items() if name not in OPERATIONAL}
     return {
         # The name for the class path, which `config.yaml` has: MLflow's plots cut values off after some ten letters.
         "architecture": type(module).__name__,

@@ -17,12 +17,11 @@ from matplotlib.lines import Line2D
 from matplotlib.text import Text
 
 from lightning_pose.figures.clips import (
-    CLIP_BASELINES,
     draw_error_by_length,
     draw_relative_trajectories,
     draw_responses,
 )
-from lightning_pose.figures.style import MODEL, TRUTH
+from lightning_pose.figures.style import CLIP_BASELINES, MODEL, TRUTH
 
 RNG = np.random.default_rng(0)
 PATH = np.stack([np.linspace(0, 4, 60), np.linspace(0, 0.1, 60), np.sin(np.linspace(0, 3, 60))], axis=1)
