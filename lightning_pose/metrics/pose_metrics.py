@@ -7,9 +7,9 @@ from torch import Tensor
 from torchmetrics import Metric
 
 from lightning_pose.geometry.quaternions import orientation_error_deg, position_error_m
-from lightning_pose.metrics.summary import RECALL_THRESHOLDS, summarize_errors
+from lightning_pose.metrics.summary import summarize_errors
 
-__all__ = ["RECALL_THRESHOLDS", "PoseMetrics", "summarize_errors"]
+__all__ = ["PoseMetrics"]
 
 
 class PoseMetrics(Metric):

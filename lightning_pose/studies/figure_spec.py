@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from lightning_pose.errors import ConfigError
+from lightning_pose.metrics.catalog import MEDIANS, find_metric
 from lightning_pose.sweeps.space import BASE, MEASURES, Parameter, nearest
 
 __all__ = ["FigureSpec", "parse_figure_spec"]
 
 KINDS = ("line", "bar", "curve", "pictures")
 FIELDS = ("x", "y", "kind", "log", "beside", "title", "table", "labels")
-ERRORS = ("position_median_m", "orientation_median_deg")
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class FigureSpec:
 
     def label(self, name: str) -> str:
         """What a setting or a metric is called where it is shown."""
-        return self.labels.get(name) or _spelt(name)
+        return self.labels.get(name) or _default_label(name)
 
 
 def parse_figure_spec(raw: Any, measure: str | None, space: Sequence[Parameter]) -> FigureSpec | None:
@@ -64,7 +64,7 @@ def parse_figure_spec(raw: Any, measure: str | None, space: Sequence[Parameter])
         raise ConfigError(f"figure.kind is {kind!r}; {nearest(str(kind), KINDS)}")
     y = _names(raw.get("y", []), "y")
     if not y and kind != "pictures":
-        y = tuple(f"{'test' if measure == 'test' else 'val'}/{name}" for name in ERRORS)
+        y = tuple(f"{'test' if measure == 'test' else 'val'}/{name}" for name in MEDIANS)
     table = _names(raw.get("table", []), "table")
     for metric in (*y, *table):
         if not metric.startswith(MEASURES[measure]):
@@ -116,22 +116,13 @@ def _labels(raw: Any) -> dict[str, str]:
     return {str(name): str(label) for name, label in raw.items()}
 
 
-SPELT = {
-    "position_median_m": "median position error (m)",
-    "orientation_median_deg": "median orientation error (°)",
-    "train_seconds": "training time (s)",
-    "parameters": "parameters",
-    "layers": "layers",
-    "ms_per_frame": "network, ms a frame",
-    "features_ms_per_frame": "features, ms a frame",
-    "frame_bytes": "bytes of a frame's features",
-    "checkpoint_bytes": "bytes of the weights' file",
-    "class_path": "features",
-    "root": "scene",
-    BASE: "system",
-}
+SETTING_LABELS = {"class_path": "features", "root": "scene", BASE: "system"}
 
 
-def _spelt(name: str) -> str:
+def _default_label(name: str) -> str:
+    """A metric's title and unit, or the last part of a setting's name, with spaces."""
+    metric = find_metric(name) if "/" in name else None
+    if metric is not None:
+        return metric.label
     last = name.rpartition("/")[2] if "/" in name else name.rpartition(".")[2]
-    return SPELT.get(last, last.replace("_", " "))
+    return SETTING_LABELS.get(last, last.replace("_", " "))

@@ -95,9 +95,10 @@ def test_no_validation_frames_is_no_loader(scene: Path) -> None:
     assert len(data.dataset("train")) == 24
 
 
-def test_no_test_frames_is_an_error(scene: Path) -> None:
+def test_no_test_frames_is_an_error(monkeypatch: pytest.MonkeyPatch, scene: Path) -> None:
     data = module(scene)
-    data._scene = replace(data.scene, splits={**data.scene.splits, "test": np.array([], int)})
+    without = replace(data.scene, splits={**data.scene.splits, "test": np.array([], int)})
+    monkeypatch.setattr(ImageDataModule, "scene", without)
     with pytest.raises(DataError, match=f"{scene} has no test frames; give"):
         data.test_dataloader()
 

@@ -11,7 +11,7 @@ import torch
 from lightning import Trainer
 
 from lightning_pose.checkpoint import build_object
-from lightning_pose.data.batches import PoseBatch, batch_loader
+from lightning_pose.data.batches import PoseBatch, make_loader
 from lightning_pose.errors import ConfigError
 from lightning_pose.geometry.quaternions import orientation_error_deg, position_error_m
 from lightning_pose.losses import LossConfig
@@ -139,12 +139,12 @@ class NoTestSplit:
 
 class LearnableWithoutTest(NoTestSplit, LearnableProblem):
     def val_dataloader(self) -> Any:
-        return batch_loader(self.dataset("val"), batch_size=8, shuffle=False)
+        return make_loader(self.dataset("val"), batch_size=8, shuffle=False)
 
 
 class ClipsWithoutTest(NoTestSplit, ClipProblem):
     def val_dataloader(self) -> Any:
-        return batch_loader(self.dataset("val"), batch_size=8, shuffle=False)
+        return make_loader(self.dataset("val"), batch_size=8, shuffle=False)
 
 
 CLOSED_FORMS: list[tuple[Architecture, dict[str, Any]]] = [

@@ -68,7 +68,7 @@ def test_it_is_trained_on_random_crops(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (rows.min(), rows.max()) == (0, 8)
     assert (columns.min(), columns.max()) == (0, 12)
     model.eval()
-    model._step(batch, "val")
+    model.validation_step(batch, 0)
     assert (model.network.cnn.crops[-1][:, 0, 0, 0] * 255 == 4).all()  # type: ignore[union-attr, index]
 
 
@@ -113,7 +113,7 @@ def test_a_module_that_comes_frozen_is_trained() -> None:
 def test_mixed_precision_leaves_poses_in_single_precision() -> None:
     model = make_model(PoseNet)
     with torch.autocast("cpu", torch.bfloat16):
-        pose = model.train()._decode(torch.rand(4, 3, 12, 12))[0]
+        pose = model.train().decode_features(torch.rand(4, 3, 12, 12))[0]
     assert pose.dtype == torch.float32
     assert (pose.bfloat16().float() != pose).any()
     trainer(precision="bf16-mixed").fit(model, datamodule=LearnableProblem([3, 12, 12]))
