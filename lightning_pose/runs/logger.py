@@ -27,15 +27,16 @@ if TYPE_CHECKING:
 __all__ = ["MLflowLogger", "find_last_run", "flatten_settings", "log_localizer"]
 
 REQUIREMENTS = (
-    "torch",
-    "lightning",
-    "opencv-contrib-python-headless",
-    "numpy",
-    "scipy",
+    "jaxtyping",
     "jsonargparse",
-    "safetensors",
+    "lightning",
+    "numpy",
+    "opencv-contrib-python-headless",
     "platformdirs",
     "rich",
+    "safetensors",
+    "scipy",
+    "torch",
 )
 """Distributions that a logged model needs; this package itself is logged with it."""
 
