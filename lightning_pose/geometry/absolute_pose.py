@@ -64,7 +64,7 @@ def find_pose_ransac(
         return None
     to_camera = Rotation.from_rotvec(turn[:, 0]).as_matrix()
     mask = np.zeros(len(points), bool)
-    mask[inliers[:, 0]] = True
+    mask[inliers[:, 0].astype(np.int64)] = True
     return CameraPose(to_camera.T, origin - to_camera.T @ shift[:, 0]), mask
 
 

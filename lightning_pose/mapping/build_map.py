@@ -166,7 +166,7 @@ def summarize_tracks(mapped: MappedFrames) -> PointMap:
         log_size=(sum_by_track(tracks.track, np.log2(size)[:, None], n) / count)[:, 0].astype(np.float32),
         direction=(direction / np.linalg.norm(direction, axis=1, keepdims=True)).astype(np.float32),
         seen_point=tracks.track[order].astype(np.int32),
-        seen_frame=tracks.frame[order].astype(np.int32),
+        seen_count=np.bincount(tracks.frame, minlength=len(frames)).astype(np.int32),
         rotation=frames.rotation,
         position=frames.position,
         given_rotation=given.rotation,

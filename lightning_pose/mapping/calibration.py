@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from lightning_pose.geometry.absolute_pose import CameraPose
 from lightning_pose.mapping.build_map import MappedFrames, summarize_tracks, triangulate_tracks
+from lightning_pose.mapping.frames import MapFrames
 from lightning_pose.mapping.map_localizer import MapAnswer, MapLocalizer
 
-__all__ = ["Calibration", "calibrate_map"]
+__all__ = ["Calibration", "Measured", "calibrate_map", "measure_answers", "measure_frames"]
 
 BLOCKS = 5
 """Parts of the training frames, each consecutive, left out in turn."""
@@ -54,40 +56,61 @@ def calibrate_map(mapped: MappedFrames) -> Calibration:
         radii by conformal prediction (Vovk, Gammerman, Shafer, 2005): the factor is the quantile of error by standard
         deviation among the accepted.
     """
-    position, orientation, accepted, ratios = [], [], [], []
+    found: list[Measured] = []
     for block in np.array_split(np.arange(len(mapped.given)), BLOCKS):
         kept = ~np.isin(mapped.tracks.frame, block)
         if not kept.any() or not len(block):
             continue
         tracks = triangulate_tracks(mapped.seen, mapped.tracks.select(kept))
         point_map = summarize_tracks(MappedFrames(mapped.given, mapped.seen, tracks, mapped.camera))
-        localizer = MapLocalizer(point_map, without=block)
-        for frame in block[:: max(1, len(block) // FRAMES_PER_BLOCK)].tolist():
-            answer = localizer.locate(mapped.given.query(frame))
-            errors = _measure_errors(answer, mapped.given.rotation[frame], mapped.given.position[frame])
-            position.append(errors[0])
-            orientation.append(errors[1])
-            accepted.append(answer.accepted)
-            if answer.accepted:
-                ratios.append((errors[0] / answer.position_sd, errors[1] / answer.orientation_sd_deg))
-    factors = _find_quantiles(np.array(ratios).reshape(-1, 2))
-    if not position:
-        return Calibration(*factors, np.nan, np.nan, 0.0)
-    return Calibration(*factors, float(np.median(position)), float(np.median(orientation)), float(np.mean(accepted)))
+        frames = mapped.given.select(block[:: max(1, len(block) // FRAMES_PER_BLOCK)])
+        found.append(measure_frames(MapLocalizer(point_map, without=block), frames))
+    if not found:
+        return Calibration(np.nan, np.nan, np.nan, np.nan, 0.0)
+    every = Measured(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+    return Calibration(
+        _find_quantile((every.position / every.position_sd)[every.accepted]),
+        _find_quantile((every.orientation_deg / every.orientation_sd_deg)[every.accepted]),
+        float(np.median(every.position)),
+        float(np.median(every.orientation_deg)),
+        float(every.accepted.mean()),
+    )
 
 
-def _measure_errors(answer: MapAnswer, rotation: np.ndarray, position: np.ndarray) -> tuple[float, float]:
-    """Distance to the given position, and angle to the given rotation in degrees."""
-    pose: CameraPose = answer.pose
-    half_sine = np.linalg.norm(pose.rotation - rotation) / np.sqrt(8)
-    return float(np.linalg.norm(pose.position - position)), float(np.degrees(2 * np.arcsin(min(half_sine, 1.0))))
+class Measured(NamedTuple):
+    """Errors of answers against given poses, (N,) each, in the scene's unit and degrees."""
+
+    position: np.ndarray
+    orientation_deg: np.ndarray
+    accepted: np.ndarray
+    position_sd: np.ndarray
+    orientation_sd_deg: np.ndarray
+    inliers: np.ndarray
 
 
-def _find_quantiles(ratios: np.ndarray) -> tuple[float, float]:
-    """For each column of (N, 2), the smallest value that at least 90 % of a further answer's would not exceed."""
-    n = len(ratios)
-    if n < MIN_ANSWERS:
-        return np.nan, np.nan
-    rank = min(int(np.ceil((n + 1) * COVERAGE)), n) - 1
-    position, orientation = np.sort(ratios, axis=0)[rank].tolist()
-    return position, orientation
+def measure_frames(localizer: MapLocalizer, frames: MapFrames) -> Measured:
+    """Locate frames, and compare the answers with the poses that the frames have."""
+    return measure_answers([localizer.locate(frames.query(i)) for i in range(len(frames))], frames)
+
+
+def measure_answers(answers: Sequence[MapAnswer], frames: MapFrames) -> Measured:
+    """Compare answers for frames with the poses that the frames have."""
+    rotation = np.array([answer.pose.rotation for answer in answers]).reshape(-1, 3, 3)
+    position = np.array([answer.pose.position for answer in answers]).reshape(-1, 3)
+    half_sine = np.linalg.norm(rotation - frames.rotation, axis=(1, 2)) / np.sqrt(8)
+    return Measured(
+        np.linalg.norm(position - frames.position, axis=1),
+        np.degrees(2 * np.arcsin(np.minimum(half_sine, 1.0))),
+        np.array([answer.accepted for answer in answers], bool),
+        np.array([answer.position_sd for answer in answers]),
+        np.array([answer.orientation_sd_deg for answer in answers]),
+        np.array([answer.inliers for answer in answers]),
+    )
+
+
+def _find_quantile(ratios: np.ndarray) -> float:
+    """The smallest value that at least 90 % of further ratios would not exceed; nan for too few ratios."""
+    if len(ratios) < MIN_ANSWERS:
+        return np.nan
+    rank = min(int(np.ceil((len(ratios) + 1) * COVERAGE)), len(ratios))
+    return float(np.sort(ratios)[rank - 1])

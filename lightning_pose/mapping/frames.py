@@ -1,4 +1,4 @@
-"""MapFrames: posed frames with keypoints, as all stages of map building read them; MapQuery: one image without a pose."""
+"""MapFrames: posed frames with keypoints, as all stages of map building read them; MapQuery: one image, no pose."""
 
 from __future__ import annotations
 

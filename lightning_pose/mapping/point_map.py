@@ -25,8 +25,8 @@ class PointMap:
         descriptors: (P, D) int8; `unit_descriptors` returns them at unit length.
         log_size: (P,) float32, mean log2 of the keypoint's diameter as an angle (radians) times its distance.
         direction: (P, 3) float32, mean direction from the point to the cameras that saw it, unit length.
-        seen_point: (O,) int32, the point of each observation.
-        seen_frame: (O,) int32, its frame; observations are sorted by frame, then point.
+        seen_point: (O,) int32, the point of each observation; observations are sorted by frame, then point.
+        seen_count: (F,) int32, how many of them each frame has.
         rotation: (F, 3, 3) float64, camera-to-world rotation of each training frame as the map has it.
         position: (F, 3) float64.
         given_rotation: (F, 3, 3) float64, as the dataset has it; the same if no pose was adjusted.
@@ -39,7 +39,7 @@ class PointMap:
     log_size: np.ndarray
     direction: np.ndarray
     seen_point: np.ndarray
-    seen_frame: np.ndarray
+    seen_count: np.ndarray
     rotation: np.ndarray
     position: np.ndarray
     given_rotation: np.ndarray
@@ -60,6 +60,11 @@ class PointMap:
         """What was wrong with the assumed camera."""
         scale, x, y, k1 = self.camera.tolist()
         return CameraCorrection(scale, np.array([x, y]), k1)
+
+    @property
+    def seen_frame(self) -> np.ndarray:
+        """(O,) int64, the frame of each observation."""
+        return np.repeat(np.arange(len(self.seen_count)), self.seen_count)
 
     @property
     def n_bytes(self) -> int:

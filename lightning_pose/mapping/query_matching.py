@@ -48,7 +48,7 @@ class QueryMatcher:
         self._descriptors = np.ascontiguousarray(point_map.unit_descriptors.T)
         length = np.bincount(point_map.seen_point, minlength=len(point_map))
         self._vote = 1 / np.sqrt(np.maximum(length, 1))
-        self._points_of_frame = np.bincount(point_map.seen_frame, minlength=len(point_map.position))
+        self._points_of_frame = point_map.seen_count.astype(np.int64)
         self._first_of_frame = np.concatenate([[0], np.cumsum(self._points_of_frame)])
         self._frames = point_map.seen_frame[np.argsort(point_map.seen_point, kind="stable")]
         self._first_of_point = np.concatenate([[0], np.cumsum(length)])

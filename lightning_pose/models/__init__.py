@@ -7,6 +7,7 @@ from lightning_pose.models.cnn_rnn import CNNRNN
 from lightning_pose.models.dense_posenet import DensePoseNet
 from lightning_pose.models.graph_pose import GraphPose
 from lightning_pose.models.kernel_posenet import KernelPoseNet
+from lightning_pose.models.landmark_map import LandmarkMap
 from lightning_pose.models.linear_posenet import LinearPoseNet
 from lightning_pose.models.node_pose import NodePose
 from lightning_pose.models.posenet import PoseNet
@@ -20,6 +21,7 @@ __all__ = [
     "DensePoseNet",
     "GraphPose",
     "KernelPoseNet",
+    "LandmarkMap",
     "LinearPoseNet",
     "NodePose",
     "Pose",

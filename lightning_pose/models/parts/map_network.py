@@ -1,0 +1,141 @@
+"""MapNetwork: a point map as a network, from an image's keypoints to its pose."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor, nn
+
+from lightning_pose.geometry.camera import Camera
+from lightning_pose.mapping.calibration import Calibration
+from lightning_pose.mapping.frames import MapFrames
+from lightning_pose.mapping.map_localizer import MapAnswer, MapLocalizer
+from lightning_pose.mapping.point_map import PointMap
+
+__all__ = ["MapNetwork", "keypoints_to_frames"]
+
+GEOMETRY = 4
+"""Columns after the descriptor: x and y in -1 to 1, log2 of size by 16 pixels, response (`LocalExtractor`)."""
+
+MAP_SHAPES = {
+    "points": ((0, 3), torch.float64),
+    "descriptors": ((0, 0), torch.int8),
+    "log_size": ((0,), torch.float32),
+    "direction": ((0, 3), torch.float32),
+    "seen_point": ((0,), torch.int32),
+    "seen_count": ((0,), torch.int32),
+    "rotation": ((0, 3, 3), torch.float64),
+    "position": ((0, 3), torch.float64),
+    "given_rotation": ((0, 3, 3), torch.float64),
+    "given_position": ((0, 3), torch.float64),
+    "camera": ((4,), torch.float64),
+}
+"""Shape and type of each array of an empty `PointMap`; the descriptor's width is added."""
+
+CAMERA_NUMBERS = 15
+
+
+def keypoints_to_frames(features: Tensor, camera: Camera, rotation: np.ndarray, position: np.ndarray) -> MapFrames:
+    """Frames for a map from what a local extractor with `with_geometry` returns.
+
+    Args:
+        features: (F, N, D + 4), rows of zeros past the real keypoints.
+        camera: of all frames.
+        rotation: (F, 3, 3), camera-to-world.
+        position: (F, 3).
+    """
+    array = features.cpu().numpy()
+    descriptors = np.ascontiguousarray(array[..., :-GEOMETRY], dtype=np.float32)
+    real: np.ndarray = (descriptors != 0).any(axis=2)
+    x, y, log_size = np.moveaxis(array[..., -GEOMETRY:-1].astype(np.float64), -1, 0)
+    pixels = np.stack([(x + 1) * camera.width / 2, (y + 1) * camera.height / 2], axis=-1)
+    points = np.where(real[..., None], camera.normalize(pixels), 0.0)
+    count = len(array)
+    return MapFrames(
+        points=points,
+        size_px=np.where(real, 16 * 2**log_size, 0).astype(np.float32),
+        descriptors=descriptors,
+        count=real.sum(axis=1),
+        focal_px=np.full(count, camera.focal_px),
+        half_view=np.tile(camera.half_view, (count, 1)),
+        rotation=rotation,
+        position=position,
+    )
+
+
+class MapNetwork(nn.Module):
+    """Locates images in a point map, which it carries as buffers with its camera and calibration.
+
+    Args:
+        n_columns: D, of a descriptor.
+    """
+
+    calibration: Tensor
+    camera_numbers: Tensor
+    position: Tensor
+
+    def __init__(self, n_columns: int) -> None:
+        super().__init__()
+        for name, (shape, kind) in MAP_SHAPES.items():
+            self.register_buffer(name, torch.zeros((0, n_columns) if name == "descriptors" else shape, dtype=kind))
+        self.register_buffer("camera_numbers", torch.zeros(CAMERA_NUMBERS, dtype=torch.float64))
+        self.register_buffer("calibration", torch.full((2,), torch.nan, dtype=torch.float64))
+        self._localizer: MapLocalizer | None = None
+        self.register_load_state_dict_post_hook(lambda module, _: module.forget_localizer())
+
+    def forget_localizer(self) -> None:
+        """Prepare the map again at the next query; its buffers have changed."""
+        self._localizer = None
+
+    def set_map(self, point_map: PointMap, camera: Camera, calibration: Calibration) -> None:
+        """Take a map, the camera that its queries have, and the factors of its radii."""
+        device = self.calibration.device
+        for field in fields(point_map):
+            kind = MAP_SHAPES[field.name][1]
+            setattr(self, field.name, torch.from_numpy(getattr(point_map, field.name)).to(device, kind))
+        numbers = [camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, camera.fisheye]
+        numbers += [*camera.distortion, *[0.0] * (8 - len(camera.distortion))]
+        self.camera_numbers = torch.tensor(numbers, dtype=torch.float64, device=device)
+        factors = [calibration.position_factor, calibration.orientation_factor]
+        self.calibration = torch.tensor(factors, dtype=torch.float64, device=device)
+        self.forget_localizer()
+
+    @property
+    def point_map(self) -> PointMap:
+        """The map; empty before `fit`."""
+        return PointMap(**{name: getattr(self, name).cpu().numpy() for name in MAP_SHAPES})
+
+    @property
+    def view(self) -> Camera:
+        """The camera of the queries."""
+        width, height, fx, fy, cx, cy, fisheye, *distortion = self.camera_numbers.tolist()
+        coefficients = tuple(distortion[:4] if fisheye else distortion) if any(distortion) else ()
+        return Camera(int(width), int(height), fx, fy, cx, cy, coefficients, bool(fisheye))
+
+    def locate(self, features: Tensor) -> list[MapAnswer]:
+        """Answers for (B, N, D + 4) features.
+
+        Raises:
+            RuntimeError: there is no map yet.
+        """
+        if not len(self.position):
+            raise RuntimeError("the map is empty; fit it first")
+        if self._localizer is None:
+            self._localizer = MapLocalizer(self.point_map)
+        nowhere = np.zeros((len(features), 3))
+        frames = keypoints_to_frames(features, self.view, np.zeros((len(features), 3, 3)), nowhere)
+        return [self._localizer.locate(frames.query(i)) for i in range(len(frames))]
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(B, N, D + 4) -> (B, 7), position and quaternion; the identity where there is no map yet."""
+        if not len(self.position):
+            pose = [[0.0, 0, 0, 1, 0, 0, 0]] * len(features)
+        else:
+            pose = [
+                [*answer.pose.position, *Rotation.from_matrix(answer.pose.rotation).as_quat(scalar_first=True)]
+                for answer in self.locate(features)
+            ]
+        return torch.tensor(np.array(pose).reshape(-1, 7), dtype=features.dtype, device=features.device)
