@@ -63,7 +63,7 @@ class TestReport(Callback):
         else:
             found = evaluate_images(trainer, pl_module, self._poses, model)
         self.evaluation = found
-        self.results = {type(pl_module).__name__: model, **found.baselines}
+        self.results = {type(pl_module).__name__: model, **found.rows, **found.baselines}
         scene = scene_datamodule(trainer).scene
         print_results(self.results, f"{scene.name}, {pl_module.headline}", found.extras)
         logger = run_logger(trainer)

@@ -12,11 +12,13 @@ from lightning_pose.data.batches import PoseBatch
 from lightning_pose.data.datamodule import SceneDataModule, scene_datamodule
 from lightning_pose.evaluation.baselines.images import BaselineResult, evaluate_baselines
 from lightning_pose.evaluation.costs import costs
+from lightning_pose.evaluation.maps import MapEvaluation, evaluate_map
 from lightning_pose.evaluation.result import Evaluation, skill
 from lightning_pose.figures import images as image_figures
 from lightning_pose.geometry.quaternions import orientation_error_deg, position_error_m
 from lightning_pose.metrics.catalog import reference_baseline
 from lightning_pose.models.base import Pose, PoseModule
+from lightning_pose.models.landmark_map import LandmarkMap
 from lightning_pose.scenes.scene import Scene
 
 __all__ = ["evaluate_images"]
@@ -50,11 +52,13 @@ def evaluate_images(
     poses = {name: Pose(*(tensor.double() for tensor in prediction)), **baselines}
     frames = [scene.frames[i] for i in test.frame.tolist()]
     metrics = {system: result.metrics for system, result in baselines.items()}
+    on_map = evaluate_map(module, datamodule) if isinstance(module, LandmarkMap) else MapEvaluation({}, {}, {})
     return Evaluation(
         baselines=metrics,
-        extras=skill(model, metrics[reference_baseline(clips=False)]) | costs(trainer, module),
+        rows=on_map.rows,
+        extras=skill(model, metrics[reference_baseline(clips=False)]) | on_map.metrics | costs(trainer, module),
         trajectories={"truth": (frames, Pose(test.position_m, test.quat_wxyz)), "predictions": (frames, prediction)},
-        figures=_draw_image_figures(scene, name, train, test, poses),
+        figures=_draw_image_figures(scene, name, train, test, poses) | on_map.figures,
     )
 
 

@@ -24,6 +24,7 @@ class Evaluation:
         curves: metrics over a whole number (a clip's length): name to {number: value}.
         trajectories: `truth` and `predictions` to frames with their poses, for TUM files.
         figures: by file name.
+        rows: further rows of the model itself for the printed table, such as over accepted frames alone.
     """
 
     baselines: Mapping[str, Mapping[str, float]]
@@ -31,6 +32,7 @@ class Evaluation:
     trajectories: Mapping[str, tuple[list[Frame], Pose]]
     figures: Mapping[str, Figure]
     curves: Mapping[str, Mapping[int, float]] = field(default_factory=dict)
+    rows: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
 
 def skill(model: Mapping[str, float], baseline: Mapping[str, float]) -> dict[str, float]:

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from rich.console import Console
 from rich.table import Table
 
-from lightning_pose.metrics.catalog import ERRORS, format_number
+from lightning_pose.metrics.catalog import ERRORS, find_metric, format_number
 
 __all__ = ["print_results", "results_markdown"]
 
@@ -47,4 +47,6 @@ def results_markdown(results: Mapping[str, Mapping[str, float]], extras: Mapping
 
 def _describe_extra(name: str, value: float) -> str:
     """`cost/train_seconds` 12.34 as `train seconds 12.3`."""
-    return f"{name.partition('/')[2].replace('_', ' ')} {format_number(value)}"
+    metric = find_metric(name)
+    number = metric.format(value) if metric is not None and metric.form == ".0%" else format_number(value)
+    return f"{name.partition('/')[2].replace('_', ' ')} {number}"

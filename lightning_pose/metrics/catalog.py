@@ -9,6 +9,7 @@ __all__ = [
     "COSTS",
     "CURVES",
     "ERRORS",
+    "MAP",
     "MEDIANS",
     "SKILLS",
     "TRAJECTORY",
@@ -92,6 +93,17 @@ SKILLS = {
 }
 """Median errors of the model, divided by those of `reference_baseline`: `test/NAME`."""
 
+MAP = {
+    "accepted": Metric("share of frames that the map accepts", form=".0%", higher_is_better=True),
+    "accepted_position_median_m": Metric("median position error of accepted frames", "m", form=".3f"),
+    "accepted_orientation_median_deg": Metric("median orientation error of accepted frames", "°", form=".2f"),
+    "coverage_position": Metric("share of accepted positions within their 90 % radius", form=".0%"),
+    "coverage_orientation": Metric("share of accepted orientations within their 90 % radius", form=".0%"),
+    "radius_median_m": Metric("median 90 % radius of accepted positions", "m", form=".3f"),
+    "radius_median_deg": Metric("median 90 % radius of accepted orientations", "°", form=".2f"),
+}
+"""Of systems with a landmark map, beside their errors: `test/NAME`."""
+
 TRAJECTORY = {
     "ate_rmse_m": Metric("absolute trajectory error, aligned", "m"),
     "ate_origin_rmse_m": Metric("absolute trajectory error from the first pose", "m"),
@@ -155,7 +167,7 @@ def reference_baseline(clips: bool) -> str:
 
 def find_metric(name: str) -> Metric | None:
     """The entry of a metric by its name in MLflow, such as `test/position_median_m`; None for an unknown one."""
-    return (ERRORS | SKILLS | TRAJECTORY | CURVES | COSTS).get(name.rpartition("/")[2])
+    return (ERRORS | SKILLS | MAP | TRAJECTORY | CURVES | COSTS).get(name.rpartition("/")[2])
 
 
 def format_number(value: float) -> str:

@@ -129,6 +129,17 @@ class MapNetwork(nn.Module):
         frames = keypoints_to_frames(features, self.view, np.zeros((len(features), 3, 3)), nowhere)
         return [self._localizer.locate(frames.query(i)) for i in range(len(frames))]
 
+    def find_radii(self, answers: list[MapAnswer]) -> tuple[np.ndarray, np.ndarray]:
+        """(N,) radii, in the scene's unit and in degrees, that hold 90 % of the errors of accepted answers.
+
+        nan where the training frames did not tell, inf where the map refuses.
+        """
+        position_factor, orientation_factor = self.calibration.tolist()
+        position = np.array([answer.position_sd for answer in answers]) * position_factor
+        orientation = np.array([answer.orientation_sd_deg for answer in answers]) * orientation_factor
+        refused = ~np.array([answer.accepted for answer in answers], bool)
+        return np.where(refused, np.inf, position), np.where(refused, np.inf, orientation)
+
     def forward(self, features: Tensor) -> Tensor:
         """(B, N, D + 4) -> (B, 7), position and quaternion; the identity where there is no map yet."""
         if not len(self.position):

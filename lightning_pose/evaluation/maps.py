@@ -1,0 +1,87 @@
+"""Evaluation of a landmark map beside its errors: what it accepts, how well it knows its errors, and its figures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from scipy.spatial.transform import Rotation
+
+from lightning_pose.data.datamodule import SceneDataModule
+from lightning_pose.figures import maps as map_figures
+from lightning_pose.geometry.quaternions import orientation_error_deg, position_error_m
+from lightning_pose.mapping.map_localizer import MapAnswer
+from lightning_pose.metrics.summary import summarize_errors
+from lightning_pose.models.landmark_map import LandmarkMap
+
+__all__ = ["MapEvaluation", "evaluate_map"]
+
+
+@dataclass
+class MapEvaluation:
+    """What a test says of a map.
+
+    Attributes:
+        metrics: `test/NAME` of `catalog.MAP`; only what is known.
+        rows: metrics over the accepted frames alone, by the row's name in the printed table.
+        figures: by file name.
+    """
+
+    metrics: dict[str, float]
+    rows: Mapping[str, Mapping[str, float]]
+    figures: dict[str, Figure]
+
+
+@torch.inference_mode()
+def evaluate_map(module: LandmarkMap, datamodule: SceneDataModule) -> MapEvaluation:
+    """Locate the test frames again, with all that the map says of each."""
+    scene = datamodule.scene
+    data = datamodule.dataset("test").data
+    answers = module.network.locate(data.features)
+    frames = [scene.frames[i] for i in data.frame.tolist()]
+    truth_m = np.array([frame.position_m for frame in frames])
+    quats = torch.from_numpy(np.array([frame.quat_wxyz for frame in frames]))
+    found_m = np.array([answer.pose.position for answer in answers])
+    position = position_error_m(torch.from_numpy(found_m), torch.from_numpy(truth_m)).numpy()
+    orientation = orientation_error_deg(torch.from_numpy(stack_quats(answers)), quats).numpy()
+    accepted = np.array([answer.accepted for answer in answers])
+    radius_m, radius_deg = module.network.find_radii(answers)
+    metrics = {"test/accepted": float(accepted.mean())}
+    rows: dict[str, Mapping[str, float]] = {}
+    if accepted.any():
+        held = summarize_errors(position[accepted], orientation[accepted])
+        rows[f"of these {accepted.mean():.0%} accepted"] = held
+        metrics["test/accepted_position_median_m"] = held["position_median_m"]
+        metrics["test/accepted_orientation_median_deg"] = held["orientation_median_deg"]
+    if accepted.any() and np.isfinite(radius_m[accepted]).all():
+        metrics["test/coverage_position"] = float((position <= radius_m)[accepted].mean())
+        metrics["test/coverage_orientation"] = float((orientation <= radius_deg)[accepted].mean())
+        metrics["test/radius_median_m"] = float(np.median(radius_m[accepted]))
+        metrics["test/radius_median_deg"] = float(np.median(radius_deg[accepted]))
+    point_map = module.network.point_map
+    about = f"LandmarkMap on {scene.name}"
+    figures = {
+        "map": map_figures.draw_map(
+            point_map.points, point_map.given_position, truth_m, found_m, accepted, title=about, unit=scene.unit
+        ),
+        "error_vs_inliers": map_figures.draw_error_vs_inliers(
+            position, np.array([answer.inliers for answer in answers]), accepted, title=about, unit=scene.unit
+        ),
+    }
+    if "test/coverage_position" in metrics:
+        figures["calibration"] = map_figures.draw_calibration(
+            (position[accepted], orientation[accepted]),
+            (radius_m[accepted], radius_deg[accepted]),
+            title=about,
+            unit=scene.unit,
+        )
+    return MapEvaluation(metrics, rows, figures)
+
+
+def stack_quats(answers: list[MapAnswer]) -> np.ndarray:
+    """(N, 4) wxyz of the answers' poses."""
+    rotations = np.array([answer.pose.rotation for answer in answers])
+    return Rotation.from_matrix(rotations).as_quat(scalar_first=True)

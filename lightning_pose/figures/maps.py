@@ -1,0 +1,123 @@
+"""The figures of a landmark map: the map from above, errors against inliers, and how well radii hold errors."""
+
+from __future__ import annotations
+
+import matplotlib
+import numpy as np
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.ticker import PercentFormatter
+
+from lightning_pose.figures.style import (
+    BASELINES,
+    MODEL,
+    SMALLEST,
+    STYLE,
+    TRAINING,
+    TRUTH,
+    find_log_limits,
+    find_longest_axes,
+    log_axis,
+)
+
+__all__ = ["draw_calibration", "draw_error_vs_inliers", "draw_map"]
+
+REFUSED = "#D55E00"
+
+
+@matplotlib.rc_context(STYLE)
+def draw_map(
+    points: np.ndarray,
+    training: np.ndarray,
+    truth: np.ndarray,
+    prediction: np.ndarray,
+    accepted: np.ndarray,
+    title: str = "Landmark map",
+    unit: str = "m",
+) -> Figure:
+    """The map's points, the training cameras, and the test frames, in the plane in which the cameras move most.
+
+    Args:
+        points: (P, 3), of the map.
+        training: (F, 3), camera centres of the training frames.
+        truth: (N, 3), of the test frames.
+        prediction: (N, 3), a segment joins each to its truth.
+        accepted: (N,) bool.
+        title: the heading.
+        unit: unit of all.
+    """
+    cameras = np.concatenate([training, truth])
+    plane = across, up = find_longest_axes(cameras)
+    low, high = np.quantile(np.concatenate([points, cameras]), [0.02, 0.98], axis=0)[:, list(plane)]
+    margin = 0.05 * (high - low).max() + SMALLEST
+    figure = Figure(figsize=(8, 7), dpi=150, layout="constrained")
+    axes = figure.add_subplot(title=title)
+    axes.plot(*points[:, plane].T, ".", color=TRAINING, markersize=1.5, label=f"{len(points):,} points of the map")
+    axes.plot(*training[:, plane].T, ".", color="#8c8c8c", markersize=3, label="training frames")
+    segments = list(np.stack([truth[:, plane], prediction[:, plane]], axis=1))
+    axes.add_collection(LineCollection(segments, colors=TRUTH, linewidths=0.7, alpha=0.5))
+    for chosen, color, label in ((accepted, MODEL, "accepted"), (~accepted, REFUSED, "refused")):
+        if chosen.any():
+            count = f"{label}, {chosen.sum()} of {len(chosen)}"
+            axes.plot(*prediction[chosen][:, plane].T, "o", color=color, markersize=4, markeredgewidth=0, label=count)
+    axes.set(
+        xlim=(low[0] - margin, high[0] + margin),
+        ylim=(low[1] - margin, high[1] + margin),
+        aspect="equal",
+        xlabel=f"{'xyz'[across]} ({unit})",
+        ylabel=f"{'xyz'[up]} ({unit})",
+    )
+    figure.legend(loc="outside lower center", ncols=4)
+    return figure
+
+
+@matplotlib.rc_context(STYLE)
+def draw_error_vs_inliers(
+    position_error: np.ndarray, inliers: np.ndarray, accepted: np.ndarray, title: str = "", unit: str = "m"
+) -> Figure:
+    """Position error of each test frame against its inliers, by which the map accepts or refuses.
+
+    Args:
+        position_error: (N,).
+        inliers: (N,).
+        accepted: (N,) bool.
+        title: the heading.
+        unit: unit of the errors.
+    """
+    figure = Figure(figsize=(7, 5), dpi=150, layout="constrained")
+    axes = figure.add_subplot(title=title or "Errors and inliers")
+    for chosen, color, label in ((accepted, MODEL, "accepted"), (~accepted, REFUSED, "refused")):
+        error = np.maximum(position_error[chosen], SMALLEST)
+        axes.plot(inliers[chosen], error, "o", color=color, markersize=4, alpha=0.6, markeredgewidth=0, label=label)
+    log_axis(axes, "y", find_log_limits(np.maximum(position_error, SMALLEST)))
+    axes.set(xlabel="inliers", ylabel=f"position error ({unit})", xlim=(0, None))
+    axes.legend()
+    return figure
+
+
+@matplotlib.rc_context(STYLE)
+def draw_calibration(
+    errors: tuple[np.ndarray, np.ndarray], radii: tuple[np.ndarray, np.ndarray], title: str = "", unit: str = "m"
+) -> Figure:
+    """The share of accepted frames whose error lies within a multiple of their 90 % radius; at 1 it should be 90 %.
+
+    Args:
+        errors: of positions and orientations (degrees), (N,) each.
+        radii: the same.
+        title: the heading.
+        unit: unit of the positions, for the legend.
+    """
+    figure = Figure(figsize=(7, 5), dpi=150, layout="constrained")
+    axes = figure.add_subplot(title=title or "Calibration")
+    for error, radius, color, label in (
+        (errors[0], radii[0], MODEL, f"position, median radius {np.median(radii[0]):.3g} {unit}"),
+        (errors[1], radii[1], BASELINES["oracle"][0], f"orientation, median radius {np.median(radii[1]):.3g}°"),
+    ):
+        ratio = np.sort(error / radius)
+        axes.plot(ratio, np.arange(1, len(ratio) + 1) / len(ratio), drawstyle="steps-post", color=color, label=label)
+    axes.axvline(1, color=TRUTH, linewidth=1, linestyle=(0, (5, 3)))
+    axes.axhline(0.9, color=TRUTH, linewidth=1, linestyle=(0, (5, 3)))
+    axes.set(xlabel="error by radius", ylabel="share of accepted frames", xlim=(0, 3), ylim=(0, 1.02))
+    axes.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
+    axes.legend(loc="lower right")
+    return figure
