@@ -48,7 +48,8 @@ def draw_map(
     """
     cameras = np.concatenate([training, truth])
     plane = across, up = find_longest_axes(cameras)
-    low, high = np.quantile(np.concatenate([points, cameras]), [0.02, 0.98], axis=0)[:, list(plane)]
+    held = np.concatenate([np.quantile(points, [0.02, 0.98], axis=0) if len(points) else cameras[:1], cameras])
+    low, high = held.min(axis=0)[list(plane)], held.max(axis=0)[list(plane)]
     margin = 0.05 * (high - low).max() + SMALLEST
     figure = Figure(figsize=(8, 7), dpi=150, layout="constrained")
     axes = figure.add_subplot(title=title)
