@@ -16,7 +16,7 @@ from mlflow.entities import Run
 from optuna.trial import TrialState
 
 from lightning_pose.sweeps.plan import read_plan
-from lightning_pose.sweeps.storage import shown
+from lightning_pose.sweeps.storage import hide_password
 from lightning_pose.sweeps.trial import EpochWatch
 from tests.helpers import REPOSITORY, Workplace
 
@@ -88,7 +88,7 @@ def test_a_class_can_be_searched_with_its_own_settings(sweep_file: Sweep) -> Non
 
 
 def test_a_password_is_not_shown() -> None:
-    assert shown("postgresql://ada:secret@host/db") == "postgresql://ada:***@host/db"
+    assert hide_password("postgresql://ada:secret@host/db") == "postgresql://ada:***@host/db"
 
 
 def test_every_architecture_has_a_sweep_file() -> None:
@@ -228,9 +228,9 @@ def test_workers_share_a_study_and_one_may_die(
     settings = {"trainer.max_epochs": 2, "trainer.callbacks": [killer]}
     file = sweep_file(sampler="grid", space={"model.units": [4, 5, 6]}, settings=settings, pruner="none")
     assert workplace.command("sweep", file, "--workers", "2") == 0
-    told = capsys.readouterr().err
-    assert "trial 3/3" in told
-    assert re.search(r"^the process of trial \d died; it is run again as trial 3$", told, re.MULTILINE)
+    errors = capsys.readouterr().err
+    assert "trial 3/3" in errors
+    assert re.search(r"^the process of trial \d died; it is run again as trial 3$", errors, re.MULTILINE)
     complete = [trial for trial in trials(workplace) if trial.state == TrialState.COMPLETE]
     (dead,) = (trial for trial in trials(workplace) if trial.state != TrialState.COMPLETE)
     assert sorted(trial.params["model.units"] for trial in complete) == [4, 5, 6]

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import yaml
 
-from lightning_pose.commands.sweep import _read_value
+from lightning_pose.commands.sweep import parse_value
 from lightning_pose.errors import ConfigError
 from lightning_pose.studies.figure_spec import parse_figure_spec
 from lightning_pose.sweeps.base_config import ParsedConfig
@@ -80,7 +80,7 @@ def test_a_class_that_is_searched_is_written_with_its_settings(sweep: Write, wor
     [("2024-05-01", "2024-05-01"), ("00", "00"), ("0x10", "0x10"), ("7", 7), ("[1, 2]", [1, 2]), ("null", None)],
 )
 def test_folders_that_look_like_dates_and_numbers(text: str, value: Any) -> None:
-    assert _read_value(text) == value
+    assert parse_value(text) == value
 
 
 def test_a_folder_of_digits_stays_a_folder(sweep: Write) -> None:
