@@ -42,7 +42,7 @@ class FigureSpec:
 
     def label(self, name: str) -> str:
         """The text for a setting or a metric on axes and in tables."""
-        return self.labels.get(name) or _spell_out(name)
+        return self.labels.get(name) or _spelt(name)
 
 
 def parse_figure_spec(raw: object, measure: str | None, space: Sequence[Parameter]) -> FigureSpec | None:
@@ -115,7 +115,7 @@ def _parse_labels(raw: object) -> dict[str, str]:
     return {str(name): str(label) for name, label in raw.items()}
 
 
-SPELLED = {
+SPELT = {
     "position_median_m": "median position error (m)",
     "orientation_median_deg": "median orientation error (°)",
     "train_seconds": "training time (s)",
@@ -131,6 +131,6 @@ SPELLED = {
 }
 
 
-def _spell_out(name: str) -> str:
+def _spelt(name: str) -> str:
     last = name.rpartition("/")[2] if "/" in name else name.rpartition(".")[2]
-    return SPELLED.get(last, last.replace("_", " "))
+    return SPELT.get(last, last.replace("_", " "))

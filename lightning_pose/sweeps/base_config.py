@@ -14,13 +14,12 @@ from lightning.pytorch.utilities.seed import isolate_rng
 from lightning_pose.cli import PoseCLI
 from lightning_pose.errors import ConfigError
 from lightning_pose.features import LocalExtractor
-from lightning_pose.sweeps.space import Config, Settings, suggest_name
+from lightning_pose.sweeps.space import BASE, Config, Parameter, Settings, name_classes, suggest_name
 
 __all__ = [
     "ParsedConfig",
     "change_value",
-    "check_known",
-    "list_settings",
+    "check_settings",
     "open_keypoint_data",
     "read_yaml",
     "resolve_config",
@@ -38,9 +37,9 @@ class ParsedConfig(PoseCLI):
     def instantiate_classes(self) -> None:
         """Overridden so that no class is built: only the config is wanted."""
 
-    def parse(self, args: list[str]) -> Config:
-        """The whole config of another command line, without the time that a new parser takes."""
-        return self.parser.parse_args(args).as_dict()
+    def change(self, base: Path, settings: Settings) -> Config:
+        """The whole config of other settings of a base config, without the time that a new parser takes."""
+        return self.parser.parse_args(["--config", str(base), *write_options(settings)]).as_dict()
 
 
 def open_keypoint_data(config: ParsedConfig) -> tuple[Any, list[Path]]:
@@ -92,13 +91,45 @@ def resolve_config(base: Path, settings: Settings) -> tuple[ParsedConfig, Config
     }
     classes = {key: value for key, value in named.items() if key.endswith(".class_path")}
     if classes:  # they have settings of their own
-        known |= list_settings(cli.parse(["--config", str(base), *write_options(classes)]))
+        known |= list_settings(cli.change(base, classes))
     for key in settings:
-        check_known(key, known, "")
-    return cli, named, cli.parse(["--config", str(base), *write_options(named)])
+        _check_known(key, known, "")
+    return cli, named, cli.change(base, named)
 
 
-def check_known(key: str, known: Settings, where: str) -> None:
+def check_settings(
+    bases: Mapping[str, Path], settings: Settings, space: Sequence[Parameter]
+) -> tuple[Config, list[Config], list[Parameter]]:
+    """Check that every key is in its base config, or under a class that is searched, with values of the right type.
+
+    Returns:
+        The settings and the space, a class by the name of its `class_path`, and each base's whole config.
+
+    Raises:
+        ConfigError: a setting is unknown, or a value is refused.
+    """
+    found = {name: resolve_config(file, settings) for name, file in bases.items()}
+    space = name_classes(space, set[str]().union(*(list_settings(resolved) for _, _, resolved in found.values())))
+    for name, (cli, named, resolved) in found.items():
+        own = [p for p in space if p.key != BASE and name in p.when.get(BASE, (name,))]
+        known = list_settings(cli.config.as_dict()) | list_settings(resolved)
+        classes = [parameter for parameter in own if parameter.key.endswith(".class_path")]
+        for parameter in classes:
+            for choice in parameter.example():
+                known |= list_settings(cli.change(bases[name], {**named, parameter.key: choice}))
+        for parameter in own:
+            _check_known(parameter.key, known, "space.")
+            if classes or set(parameter.when) - {BASE}:
+                continue  # it may suit some trials only; each of them checks it
+            for value in parameter.example():
+                try:
+                    cli.change(bases[name], {**named, parameter.key: value})
+                except ConfigError as error:
+                    raise ConfigError(f"space.{parameter.key} cannot be {value!r}: {error}") from error
+    return next(iter(found.values()))[1], [resolved for _, _, resolved in found.values()], space
+
+
+def _check_known(key: str, known: Settings, where: str) -> None:
     """Refuse a setting that a config does not have.
 
     Raises:

@@ -13,15 +13,7 @@ import numpy as np
 from lightning_pose.errors import ConfigError
 from lightning_pose.metrics.summary import summarize_errors
 from lightning_pose.paths import default_tracking_uri
-from lightning_pose.sweeps.base_config import (
-    ParsedConfig,
-    change_value,
-    check_known,
-    list_settings,
-    read_yaml,
-    resolve_config,
-    write_options,
-)
+from lightning_pose.sweeps.base_config import ParsedConfig, change_value, check_settings, read_yaml, write_options
 from lightning_pose.sweeps.space import (
     BASE,
     MEASURES,
@@ -29,7 +21,6 @@ from lightning_pose.sweeps.space import (
     Parameter,
     Settings,
     check_when,
-    name_classes,
     normalize_key,
     parse_space,
     suggest_name,
@@ -58,7 +49,7 @@ class Plan:
 
     Attributes:
         file: the sweep file.
-        bases: the base configs by name; where there are several, the parameter `base` says which a trial has.
+        bases: the base configs by name; where there are several, the parameter `base` names that of a trial.
         objectives: one or several.
         sampler: name and options.
         pruner: name and options.
@@ -163,7 +154,7 @@ def read_plan(file: Path, overrides: Settings) -> Plan:
     space = _narrow_space(raw.get("space"), bases, overrides)
     searched = {parameter.key for parameter in space}
     settings |= {k: value for k, value in overrides.items() if not k.startswith("space.") and k not in searched}
-    settings, configs, space = _check_keys(bases, settings, space)
+    settings, configs, space = check_settings(bases, settings, space)
     resolved = configs[0]
     alike = len({json.dumps(config["model"]["init_args"].get("loss"), default=str) for config in configs}) == 1
     usual = FEATURES[0] if measure == "features" else "val/loss" if alike else "val/position_median_m"
@@ -273,37 +264,3 @@ def _parse_objective(entry: object, known: Sequence[str]) -> Objective:
     if goal not in ("minimize", "maximize"):
         raise ConfigError(f"objective {metric} has goal {goal!r}; give minimize or maximize")
     return Objective(metric, goal == "maximize")
-
-
-def _check_keys(
-    bases: Mapping[str, Path], settings: Settings, space: Sequence[Parameter]
-) -> tuple[Config, list[Config], list[Parameter]]:
-    """Every key exists, in its base config or under a class that is searched, and has values of the right type.
-
-    Returns:
-        The settings and the space, a class by the name of its `class_path`, and each base's whole config.
-    """
-    found = {name: resolve_config(file, settings) for name, file in bases.items()}
-    known = set[str]().union(*(list_settings(resolved) for _, _, resolved in found.values()))
-    space = name_classes(space, known)
-    for name, (cli, named, resolved) in found.items():
-        own = [p for p in space if p.key != BASE and name in (p.when or {}).get(BASE, (name,))]
-        _check_base(bases[name], cli, named, resolved, own)
-    return next(iter(found.values()))[1], [resolved for _, _, resolved in found.values()], space
-
-
-def _check_base(base: Path, cli: ParsedConfig, named: Settings, resolved: Settings, own: Sequence[Parameter]) -> None:
-    known = list_settings(cli.config.as_dict()) | list_settings(resolved)
-    classes = [parameter for parameter in own if parameter.key.endswith(".class_path")]
-    for parameter in classes:
-        for choice in parameter.example():
-            known |= list_settings(cli.parse(["--config", str(base), *write_options({**named, parameter.key: choice})]))
-    for parameter in own:
-        check_known(parameter.key, known, "space.")
-        if classes or set(parameter.when or ()) - {BASE}:
-            continue  # it may suit some trials only; each of them checks it
-        for value in parameter.example():
-            try:
-                cli.parse(["--config", str(base), *write_options({**named, parameter.key: value})])
-            except ConfigError as error:
-                raise ConfigError(f"space.{parameter.key} cannot be {value!r}: {error}") from error

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import warnings
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -55,8 +57,8 @@ def describe_best(study: Study, plan: Plan) -> str:
 
 def count_states(study: Study) -> str:
     """How many trials ended how, as `5 complete, 1 pruned`."""
-    states = [trial.state.name.lower() for trial in study.get_trials(deepcopy=False)]
-    return ", ".join(f"{states.count(name)} {name}" for name in dict.fromkeys(sorted(states)))
+    states = Counter(trial.state.name.lower() for trial in study.get_trials(deepcopy=False))
+    return ", ".join(f"{number} {state}" for state, number in sorted(states.items()))
 
 
 def write_best(trial: FrozenTrial, study: Study, plan: Plan, folder: Path) -> Path:
@@ -124,20 +126,22 @@ def plan_figures(study: Study, objectives: Sequence[Objective]) -> Iterator[tupl
     """Optuna's figures of a study: the name of each, and a function that draws it."""
     from optuna.visualization import matplotlib as draw
 
-    several = len(objectives) > 1
+    kinds: dict[str, Callable[..., Any]] = {
+        "history": draw.plot_optimization_history,
+        "slice": draw.plot_slice,
+        "parallel_coordinate": draw.plot_parallel_coordinate,
+        "importance": draw.plot_param_importances,
+    }
     for i, objective in enumerate(objectives):
-        named: Config = {"target_name": objective.metric}
-        weighed = named
-        if several:  # for one, Optuna takes the direction of the study, and draws the best so far
-            named = named | {"target": lambda trial, i=i: trial.values[i]}
-            sign = -1 if objective.maximize else 1  # importance is that for the lowest targets
-            weighed = named | {"target": lambda trial, i=i, sign=sign: sign * trial.values[i]}
-        end = f"_{objective.metric.replace('/', '_')}" if several else ""
-        yield f"history{end}", lambda named=named: draw.plot_optimization_history(study, **named)
-        yield f"slice{end}", lambda named=named: draw.plot_slice(study, **named)
-        yield f"parallel_coordinate{end}", lambda named=named: draw.plot_parallel_coordinate(study, **named)
-        if len({trial.values[i] for trial in study.get_trials(False, (TrialState.COMPLETE,))}) > 1:
-            yield f"importance{end}", lambda named=weighed: draw.plot_param_importances(study, **named)
+        values = {trial.values[i] for trial in study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))}
+        for name, draw_kind in kinds.items():
+            options: Config = {"target_name": objective.metric}
+            if len(objectives) > 1:  # for one, Optuna takes the direction of the study, and draws the best so far
+                # Importance is that for the lowest targets.
+                sign = -1 if name == "importance" and objective.maximize else 1
+                options["target"] = lambda trial, i=i, sign=sign: sign * trial.values[i]
+                name = f"{name}_{objective.metric.replace('/', '_')}"
+            if not name.startswith("importance") or len(values) > 1:
+                yield name, partial(draw_kind, study, **options)
     if len(objectives) in (2, 3):
-        names = [objective.metric for objective in objectives]
-        yield "pareto_front", lambda: draw.plot_pareto_front(study, target_names=names)
+        yield "pareto_front", partial(draw.plot_pareto_front, study, target_names=[o.metric for o in objectives])

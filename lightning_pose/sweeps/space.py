@@ -6,7 +6,7 @@ import itertools
 import json
 import math
 from collections.abc import Container, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
 
@@ -67,11 +67,11 @@ class Parameter:
     step: float | None = None
     log: bool = False
     choices: Mapping[Scalar, Any] | None = None
-    when: Mapping[str, tuple[Any, ...]] | None = None
+    when: Mapping[str, tuple[Any, ...]] = field(default_factory=dict)
 
     def active(self, values: Settings) -> bool:
         """Whether it is searched, given the values of the parameters before it."""
-        return all(key in values and values[key] in wanted for key, wanted in (self.when or {}).items())
+        return all(key in values and values[key] in wanted for key, wanted in self.when.items())
 
     def draw(self, trial: Trial) -> Any:
         """A value that Optuna suggests, as the config has it."""
@@ -111,11 +111,10 @@ class Parameter:
 
     def describe(self) -> Config:
         """The parameter as JSON has it; a study is only continued with the same space."""
+        content: Config = {"low": self.low, "high": self.high, "step": self.step, "log": self.log}
         if self.choices is not None:
-            content: Config = {"type": self.kind, "choices": list(self.choices)}
-        else:
-            content = {"type": self.kind, "low": self.low, "high": self.high, "step": self.step, "log": self.log}
-        return content | {"when": {key: list(values) for key, values in (self.when or {}).items()}}
+            content = {"choices": list(self.choices)}
+        return {"type": self.kind, **content, "when": {key: list(values) for key, values in self.when.items()}}
 
 
 def parse_space(space: object) -> list[Parameter]:
@@ -141,9 +140,9 @@ def _parse_parameter(key: str, entry: object) -> Parameter:
         entry = {"choices": entry}
     if not isinstance(entry, Mapping):
         raise ConfigError(f"space.{key} is {entry!r}; give a list of choices, or {{type: int, low: 1, high: 9}}")
-    for field in entry:
-        if field not in FIELDS:
-            raise ConfigError(f"space.{key} has no field {field!r}; {suggest_name(str(field), sorted(FIELDS))}")
+    for name in entry:
+        if name not in FIELDS:
+            raise ConfigError(f"space.{key} has no field {name!r}; {suggest_name(str(name), sorted(FIELDS))}")
     kind = entry.get("type", "categorical" if "choices" in entry else None)
     if kind not in KINDS:
         raise ConfigError(f"space.{key} has type {kind!r}; {suggest_name(str(kind), KINDS)}")
@@ -152,7 +151,8 @@ def _parse_parameter(key: str, entry: object) -> Parameter:
         choices = entry.get("choices")
         if not isinstance(choices, list) or not choices:
             raise ConfigError(f"space.{key} is categorical with choices {choices!r}; give a list")
-        return Parameter(key, kind, choices={_store_choice(choice): choice for choice in choices}, when=when)
+        labels = [json.dumps(choice) if isinstance(choice, list | dict) else choice for choice in choices]
+        return Parameter(key, kind, choices=dict(zip(labels, choices, strict=True)), when=when)
     return _parse_range(key, kind, entry, when)
 
 
@@ -199,7 +199,7 @@ def check_when(space: Sequence[Parameter]) -> None:
     """
     choices = {parameter.key: list(parameter.choices.values()) for parameter in space if parameter.choices}
     for parameter in space:
-        for key, wanted in (parameter.when or {}).items():
+        for key, wanted in parameter.when.items():
             for value in wanted:
                 if key in choices and value not in choices[key]:
                     raise ConfigError(
@@ -207,14 +207,10 @@ def check_when(space: Sequence[Parameter]) -> None:
                     )
 
 
-def _store_choice(choice: object) -> Scalar:
-    return choice if choice is None or isinstance(choice, str | int | float | bool) else json.dumps(choice)
-
-
 def _sort_by_when(parameters: dict[str, Parameter]) -> list[Parameter]:
     """Each parameter after those that its `when` names, otherwise in the order of the file."""
     for name, parameter in parameters.items():
-        when = dict(parameter.when or {})
+        when = dict(parameter.when)
         for key, wanted in when.items():
             if key not in parameters:
                 raise ConfigError(
@@ -227,7 +223,7 @@ def _sort_by_when(parameters: dict[str, Parameter]) -> list[Parameter]:
     left = list(parameters.values())
     while left:
         known = {parameter.key for parameter in ordered}
-        ready = next((parameter for parameter in left if known.issuperset(parameter.when or ())), None)
+        ready = next((parameter for parameter in left if known.issuperset(parameter.when)), None)
         if ready is None:
             raise ConfigError(f"space.{left[0].key} waits for itself through its when; break the circle")
         ordered.append(ready)
@@ -243,7 +239,7 @@ def name_classes(space: Sequence[Parameter], known: Container[str]) -> list[Para
         if f"{parameter.key}.class_path" in known and all(isinstance(value, str) for value in parameter.example())
     }
     return [
-        replace(p, key=names.get(p.key, p.key), when={names.get(k, k): wanted for k, wanted in (p.when or {}).items()})
+        replace(p, key=names.get(p.key, p.key), when={names.get(k, k): wanted for k, wanted in p.when.items()})
         for p in space
     ]
 

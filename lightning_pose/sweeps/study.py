@@ -133,7 +133,7 @@ def _normalize_name(name: str) -> str:
 def _build_sampler(plan: Plan, seed: int) -> samplers.BaseSampler:
     name = _normalize_name(plan.sampler["name"])
     if name == "cmaes" and len(plan.objectives) > 1:
-        raise ConfigError("sampler cmaes serves one objective; take nsga2 or tpe for several")
+        raise ConfigError("sampler cmaes is for one objective; take nsga2 or tpe for several")
     if name == "cmaes" and find_spec("cmaes") is None:  # Optuna would find out in the middle of the sweep
         raise ConfigError("sampler cmaes needs the package cmaes; `uv sync --extra sweep` installs it, or take tpe")
     # The points of qmc are one sequence, which the study counts for all workers.
@@ -188,18 +188,18 @@ def count_waiting(study: Study) -> int:
     return len(study.get_trials(deepcopy=False, states=(TrialState.WAITING,)))
 
 
-def queue_again(study: Study, trial: FrozenTrial, died: bool) -> int | None:
+def queue_again(study: Study, trial: FrozenTrial, lost: bool) -> int | None:
     """Queue a trial again that did not fail by itself, but not one that ends its process every time.
 
     Args:
         study: of the trial.
         trial: which has ended.
-        died: whether its process was lost, which is counted; interrupts by the user are not.
+        lost: whether its process was lost, which is counted; interrupts by the user are not.
 
     Returns:
         The number of the queued trial, None where its process has ended too often.
     """
-    deaths = trial.user_attrs.get(DEATHS, 0) + died
+    deaths = trial.user_attrs.get(DEATHS, 0) + lost
     if deaths > DEATHS_FORGIVEN:
         return None
     again = copy.deepcopy(trial)
@@ -211,7 +211,7 @@ def queue_again(study: Study, trial: FrozenTrial, died: bool) -> int | None:
 
 def _requeue_stale(tracking: str, study: Study, trial: FrozenTrial) -> None:
     """Queue a trial again that Optuna has failed because it had no heartbeat, on any machine."""
-    _report_lost(trial.number, "sent no heartbeat", queue_again(study, trial, died=True))
+    _report_lost(trial.number, "sent no heartbeat", queue_again(study, trial, lost=True))
     close_run(MlflowClient(tracking), trial.user_attrs.get(RUN), "its process sent no heartbeat")
 
 
@@ -242,7 +242,7 @@ def recover_trials(study: Study, storage: RDBStorage, client: MlflowClient) -> t
             storage.set_trial_state_values(trial_id, TrialState.FAIL)
         except UpdateFinishedTrialError:
             continue  # it has just ended
-        number = queue_again(study, trial, died=True)
+        number = queue_again(study, trial, lost=True)
         _report_lost(trial.number, "died", number)
         queued, given_up = queued + (number is not None), given_up + (number is None)
         close_run(client, trial.user_attrs.get(RUN), "its process died")

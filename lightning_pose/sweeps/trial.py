@@ -169,107 +169,108 @@ def run_trial(trial: Trial, plan: Plan, parent: str) -> list[float]:
         KeyboardInterrupt: the user did.
         Exception: what went wrong in it, which is recorded in Optuna and MLflow first.
     """
-    client = MlflowClient(plan.tracking[0])
-    run = None
+    record = _TrialRecord(trial, plan)
     try:
-        run = _create_run(trial, plan, parent, client)
+        run = record.create_run(parent)
         values = draw_values(trial, plan.space)
         for key, value in values.items():
-            client.set_tag(run, f"sweep.{key}", str(value))
+            record.client.set_tag(run, f"sweep.{key}", str(value))
         if plan.measure == "features":
-            return _measure_features(trial, plan, values, client, run)
-        return _run_fit(trial, plan, [*plan.arguments(values), f"--trainer.logger.run_id={run}"], client, run)
+            return _measure_features(record, run, values)
+        watch = EpochWatch(plan, trial)
+        with shared_factors():
+            cli = TrialCLI([*plan.arguments(values), f"--trainer.logger.run_id={run}"], watch, plan)
+        if watch.pruned is not None:
+            raise optuna.TrialPruned(watch.pruned)
+        return record.keep_values(watch.values() | cli.measured, cli.curves)
     except optuna.TrialPruned as pruned:
-        _record_end(trial, client, run, "PRUNED", "KILLED", str(pruned))
+        record.keep_reason("PRUNED", "KILLED", str(pruned))
         raise
     except (KeyboardInterrupt, SystemExit) as stop:  # Lightning turns Ctrl-C and SIGTERM into SystemExit
-        _record_end(trial, client, run, "INTERRUPTED", "KILLED", "interrupted")
+        record.keep_reason("INTERRUPTED", "KILLED", "interrupted")
         raise KeyboardInterrupt from stop
     except Exception as error:
         reason = str(error) if isinstance(error, PoseError) else f"{type(error).__name__}: {error}"
-        _record_end(trial, client, run, "FAILED", "FAILED", reason, traceback.format_exc())
+        record.keep_reason("FAILED", "FAILED", reason, traceback.format_exc())
         raise
 
 
-def _create_run(trial: Trial, plan: Plan, parent: str, client: MlflowClient) -> str:
-    known = client.get_experiment_by_name(plan.tracking[1])
-    assert known is not None, "the study's run is in it"
-    study = trial.study.study_name
-    tags = {PARENT_TAG: parent, "sweep.study": study, "sweep.trial": str(trial.number), **process_tags()}
-    name = f"{study} trial {trial.number}"  # until its settings are known
-    run = client.create_run(known.experiment_id, run_name=name, tags=tags).info.run_id
-    trial.set_user_attr(RUN, run)
-    with contextlib.suppress(MlflowException):  # if the user has deleted it, the trial runs all the same
-        # A command that ended between two trials of this one has closed it.
-        client.update_run(parent, status="RUNNING")
-    return run
-
-
-def _run_fit(trial: Trial, plan: Plan, args: list[str], client: MlflowClient, run: str) -> list[float]:
-    watch = EpochWatch(plan, trial)
-    with shared_factors():
-        cli = TrialCLI(args, watch, plan)
-    if watch.pruned is not None:
-        raise optuna.TrialPruned(watch.pruned)
-    return _record_values(trial, plan, watch.values() | cli.measured, cli.curves, client, run)
-
-
-def _measure_features(trial: Trial, plan: Plan, values: Settings, client: MlflowClient, run: str) -> list[float]:
-    data, images = open_keypoint_data(ParsedConfig(plan.arguments(values)))
+def _measure_features(record: _TrialRecord, run: str, values: Settings) -> list[float]:
+    """Measure keypoints instead of training."""
+    data, images = open_keypoint_data(ParsedConfig(record.plan.arguments(values)))
     metrics, curves = measure_keypoints(data.cache, images, data.extractor.n_features)
-    for name, value in metrics.items():
-        client.log_metric(run, name, value)
-    for name, curve in curves.items():
+    for name, curve in (*((name, {0: value}) for name, value in metrics.items()), *curves.items()):
         for number, value in curve.items():
-            client.log_metric(run, name, value, step=number)
-    client.set_terminated(run, "FINISHED")
-    return _record_values(trial, plan, metrics, curves, client, run)
+            record.client.log_metric(run, name, value, step=number)
+    record.client.set_terminated(run, "FINISHED")
+    return record.keep_values(metrics, curves)
 
 
-def _record_values(
-    trial: Trial,
-    plan: Plan,
-    found: Mapping[str, float],
-    curves: Mapping[str, Mapping[int, float]],
-    client: MlflowClient,
-    run: str,
-) -> list[float]:
-    """Record what a trial measured, for the study's table and figure; returns the objectives' values.
+class _TrialRecord:
+    """What Optuna and MLflow keep of a trial.
 
-    Raises:
-        ConfigError: one of the values is no finite number.
+    Args:
+        trial: Optuna's.
+        plan: of the sweep.
+
+    Attributes:
+        client: of the store that has the trial's MLflow run.
+        run: id of this run; None before it is created.
     """
-    values = {objective.metric: found[objective.metric] for objective in plan.objectives}
-    for metric, value in values.items():
-        if not math.isfinite(value):  # Optuna would fail the trial too, but without a reason
-            raise ConfigError(
-                f"{metric} came out as {value}; lower the learning rate, or leave it out of the objectives"
-            )
-    trial.set_user_attr(METRICS, {name: value for name, value in found.items() if math.isfinite(value)})
-    if curves:
-        trial.set_user_attr(CURVES, {name: list(map(list, curve.items())) for name, curve in curves.items()})
-    for metric, value in values.items():
-        client.log_metric(run, f"objective/{metric}", value)
-    client.set_tag(run, "sweep.state", "COMPLETE")
-    return list(values.values())
 
+    def __init__(self, trial: Trial, plan: Plan) -> None:
+        self.trial, self.plan = trial, plan
+        self.client = MlflowClient(plan.tracking[0])
+        self.run: str | None = None
 
-def _record_end(
-    trial: Trial, client: MlflowClient, run: str | None, state: str, status: str, reason: str, error: str | None = None
-) -> None:
-    """Record in Optuna and MLflow why a trial has no value.
+    def create_run(self, parent: str) -> str:
+        """Create the trial's MLflow run in that of the study; returns its id."""
+        experiment = self.client.get_experiment_by_name(self.plan.tracking[1])
+        assert experiment is not None, "the study's run is in it"
+        study, number = self.trial.study.study_name, self.trial.number
+        tags = {PARENT_TAG: parent, "sweep.study": study, "sweep.trial": str(number), **process_tags()}
+        name = f"{study} trial {number}"  # until its settings are known
+        self.run = self.client.create_run(experiment.experiment_id, run_name=name, tags=tags).info.run_id
+        self.trial.set_user_attr(RUN, self.run)
+        with contextlib.suppress(MlflowException):  # if the user has deleted it, the trial runs all the same
+            # A command that ended between two trials of this one has closed it.
+            self.client.update_run(parent, status="RUNNING")
+        return self.run
 
-    A store that fails here must not hide what ended the trial, least of all a Ctrl-C.
-    """
-    shown = " ".join(reason.split())[:500]
-    # Refused where another process has already failed the trial with a reason of its own.
-    with contextlib.suppress(OptunaError):
-        trial.set_user_attr(REASON, shown)
-    if run is None:
-        return
-    with contextlib.suppress(MlflowException, OSError):
-        client.set_tag(run, "sweep.state", state)
-        client.set_tag(run, "sweep.reason", shown)
-        client.set_terminated(run, status)
-        if error is not None:
-            client.log_text(run, error, "error.txt")
+    def keep_values(self, found: Mapping[str, float], curves: Mapping[str, Mapping[int, float]]) -> list[float]:
+        """Keep what a trial measured, for the study's table and figure; returns the objectives' values.
+
+        Raises:
+            ConfigError: one of the values is no finite number.
+        """
+        values = {objective.metric: found[objective.metric] for objective in self.plan.objectives}
+        for metric, value in values.items():
+            if not math.isfinite(value):  # Optuna would fail the trial too, but without a reason
+                raise ConfigError(
+                    f"{metric} came out as {value}; lower the learning rate, or leave it out of the objectives"
+                )
+        self.trial.set_user_attr(METRICS, {name: value for name, value in found.items() if math.isfinite(value)})
+        if curves:
+            self.trial.set_user_attr(CURVES, {name: list(map(list, curve.items())) for name, curve in curves.items()})
+        for metric, value in values.items():
+            self.client.log_metric(str(self.run), f"objective/{metric}", value)
+        self.client.set_tag(str(self.run), "sweep.state", "COMPLETE")
+        return list(values.values())
+
+    def keep_reason(self, state: str, status: str, reason: str, error: str | None = None) -> None:
+        """Keep why a trial has no value.
+
+        A store that fails here must not hide what ended the trial, least of all a Ctrl-C.
+        """
+        shown = " ".join(reason.split())[:500]
+        # Refused where another process has already failed the trial with a reason of its own.
+        with contextlib.suppress(OptunaError):
+            self.trial.set_user_attr(REASON, shown)
+        if self.run is None:
+            return
+        with contextlib.suppress(MlflowException, OSError):
+            self.client.set_tag(self.run, "sweep.state", state)
+            self.client.set_tag(self.run, "sweep.reason", shown)
+            self.client.set_terminated(self.run, status)
+            if error is not None:
+                self.client.log_text(self.run, error, "error.txt")

@@ -128,7 +128,7 @@ def run_next_trial(study: Study, storage: RDBStorage, job: Job) -> bool:
             study.optimize(objective, n_trials=1, catch=(Exception,), gc_after_trial=True)
         except KeyboardInterrupt:
             if interrupted and _find_trial(study, own).state == TrialState.FAIL:  # not one that had ended before
-                queue_again(study, _find_trial(study, own), died=False)
+                queue_again(study, _find_trial(study, own), lost=False)
             raise
         except (AssertionError, ValueError, UpdateFinishedTrialError) as error:
             # Optuna raises these for a result that comes too late, as after this machine slept; or a sampler fails.

@@ -1,4 +1,4 @@
-"""The verb sweep on a tiny scene: studies, their runs, how they go on, and what they leave."""
+"""The verb sweep on a tiny scene: studies, their runs, their results, and how they are continued."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ def test_a_sweep_leaves_runs_and_a_config_that_trains_and_goes_on(
 
     assert workplace.command(*command) == 0
     assert [trial.state for trial in trials(workplace)] == [TrialState.COMPLETE] * 4
-    assert len({trial.params["model.units"] for trial in trials(workplace)}) > 2, "the sampler starts over"
+    assert len({trial.params["model.units"] for trial in trials(workplace)}) > 2, "the sampler draws the same again"
     again, children = parent_and_children(workplace)
     assert (again.info.run_id, again.info.status, len(children)) == (parent.info.run_id, "FINISHED", 4)
 
@@ -150,7 +150,7 @@ def test_a_sweep_leaves_runs_and_a_config_that_trains_and_goes_on(
     assert fitted.data.metrics["val/position_median_m"] == pytest.approx(best.value or 0, rel=1e-4)
 
 
-def test_a_trial_is_worth_what_fit_would_keep_of_it(workplace: Workplace, sweep_file: Sweep) -> None:
+def test_a_trial_has_the_value_of_the_epoch_that_fit_keeps(workplace: Workplace, sweep_file: Sweep) -> None:
     settings = {"trainer.max_epochs": 6, "model.learning_rate": 0.3, "best.monitor": "val/orientation_median_deg"}
     file = sweep_file(objective="val/position_median_m", pruner="none", settings=settings)
     assert workplace.command("sweep", file, "--n_trials", "1") == 0
@@ -162,7 +162,7 @@ def test_a_trial_is_worth_what_fit_would_keep_of_it(workplace: Workplace, sweep_
     assert trial.value == pytest.approx(fitted.data.metrics["best/val/position_median_m"], rel=1e-4)
 
 
-def test_the_epoch_that_fit_keeps_counts_and_not_the_best_of_the_objective(sweep_file: Sweep) -> None:
+def test_the_epoch_is_chosen_by_the_monitor_and_not_by_the_objective(sweep_file: Sweep) -> None:
     plan = read_plan(sweep_file(objective="val/position_median_m"), {})
     watch = EpochWatch(plan, optuna.trial.create_trial(value=0.0))  # type: ignore[arg-type]
     watch.epochs = [
@@ -210,7 +210,7 @@ def test_a_hopeless_trial_is_pruned(workplace: Workplace, sweep_file: Sweep) -> 
     assert "after epoch 1" in run.data.tags["sweep.reason"]
 
 
-def test_two_objectives_have_a_front(workplace: Workplace, sweep_file: Sweep) -> None:
+def test_two_objectives_have_a_pareto_front(workplace: Workplace, sweep_file: Sweep) -> None:
     file = sweep_file(objective=["val/position_median_m", "cost/parameters"], sampler="nsga2")
     assert workplace.command("sweep", file, "--n_trials", "2", "--out", workplace.folder / "out") == 0
     by_units = sorted(trials(workplace), key=lambda trial: trial.params["model.units"])
@@ -220,7 +220,7 @@ def test_two_objectives_have_a_front(workplace: Workplace, sweep_file: Sweep) ->
     assert (workplace.folder / "out" / "best.yaml").is_file()
 
 
-def test_workers_share_a_study_and_one_may_die(
+def test_workers_share_a_study_and_one_is_killed(
     workplace: Workplace, sweep_file: Sweep, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Exactly the cells of the grid, each once, although a worker is killed in the middle of a trial."""

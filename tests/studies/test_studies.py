@@ -76,7 +76,7 @@ def test_a_study_of_two_systems_measures_the_test_frames(
     )
     assert workplace.command("sweep", file) == 0
     printed = capsys.readouterr().out
-    assert "retrieval_top1" not in printed, "a test's own table would bury the study's"
+    assert "retrieval_top1" not in printed, "the table of each test is not printed"
     found = rows(workplace)
     assert [(row["base"], row["model.units"]) for row in found] == [
         ("tiny", "4"), ("tiny", "8"), ("small", "4"), ("small", "4"), ("small", "8"), ("small", "8"),
@@ -106,7 +106,7 @@ def test_a_study_of_two_systems_measures_the_test_frames(
     assert "base" not in best
 
 
-def test_a_trial_that_fails_is_a_row_that_says_why(workplace: Workplace, study: Study) -> None:
+def test_a_failed_trial_is_a_row_with_its_reason(workplace: Workplace, study: Study) -> None:
     file = study(measure="test", space={"model.units": [0, 4]}, figure={"x": "model.units"})
     assert workplace.command("sweep", file) == 0
     failed, ended = rows(workplace)
@@ -201,7 +201,7 @@ def check_file(file: Path) -> None:
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_a_study_that_cannot_be_is_refused(entries: dict[str, Any], message: str, study: Study) -> None:
+def test_a_malformed_study_is_refused(entries: dict[str, Any], message: str, study: Study) -> None:
     with pytest.raises(ConfigError, match=message):
         check_file(study(**entries))
 

@@ -111,7 +111,7 @@ def test_a_trial_may_be_interrupted_more_often_than_its_process_is_killed(
     for _ in range(5):
         number = study.ask().number
         study.tell(number, state=TrialState.FAIL)
-        assert queue_again(study, study.trials[number], died=False) == number + 1
+        assert queue_again(study, study.trials[number], lost=False) == number + 1
     for again in (True, True, True, False):
         study.ask().set_user_attr("process", dead_process())
         dead = last(study).number
@@ -298,7 +298,9 @@ def test_a_trial_without_a_run_has_a_reason(job: workers.Job, monkeypatch: pytes
 
 
 @pytest.mark.parametrize("gone", ["mlflow", "optuna"])
-def test_a_store_that_fails_hides_no_ctrl_c(gone: str, job: workers.Job, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_ctrl_c_ends_the_sweep_although_a_store_fails(
+    gone: str, job: workers.Job, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def fail(*args: Any, **kwargs: Any) -> NoReturn:
         raise MlflowException("out of reach") if gone == "mlflow" else StorageInternalError
 

@@ -81,7 +81,7 @@ def study_file(workplace: Workplace) -> Callable[..., Path]:
     return write
 
 
-def test_a_figure_of_what_was_not_measured_loses_nothing(
+def test_a_figure_of_what_was_not_measured_is_refused_after_the_results(
     workplace: Workplace, study_file: Callable[..., Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = workplace.folder / "mlruns" / "sweeps" / "study-wall"

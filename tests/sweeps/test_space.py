@@ -58,7 +58,7 @@ def test_a_condition_on_a_list_is_one_choice() -> None:
     assert {point["model.channels"] for point in with_x} == {json.dumps([4, 8])}
 
 
-def test_a_class_is_known_by_its_class_path() -> None:
+def test_a_class_is_renamed_to_its_class_path() -> None:
     space = parse_space({"model": ["a.One", "a.Two"], "x": {"choices": [1], "when": {"model": "a.One"}}})
     named, waiting = name_classes(space, {"model.class_path", "x"})
     assert named.key == "model.class_path"
