@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+from collections.abc import Callable
 from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -248,7 +249,9 @@ def _build_parser() -> VerbParser:
     return parser
 
 
-def _parse_count(least: int) -> Any:
+def _parse_count(least: int) -> Callable[[str], int]:
+    """A parser of whole numbers from `least` on, for argparse."""
+
     def whole(text: str) -> int:
         if not text.isdigit() or int(text) < least:
             raise argparse.ArgumentTypeError(f"is {text}, give {least} or more")

@@ -21,7 +21,7 @@ from mlflow import MlflowClient
 from optuna import Study
 from optuna.exceptions import UpdateFinishedTrialError
 from optuna.storages import RDBStorage, fail_stale_trials
-from optuna.trial import FrozenTrial, TrialState
+from optuna.trial import TrialState
 
 from lightning_pose.runs.process import process_name
 from lightning_pose.runs.tags import PROCESS
@@ -127,21 +127,18 @@ def run_next_trial(study: Study, storage: RDBStorage, job: Job) -> bool:
         try:
             study.optimize(objective, n_trials=1, catch=(Exception,), gc_after_trial=True)
         except KeyboardInterrupt:
-            if interrupted and _find_trial(study, own).state == TrialState.FAIL:  # not one that had ended before
-                queue_again(study, _find_trial(study, own), lost=False)
+            trial = study.trials[own] if interrupted and own is not None else None
+            if trial is not None and trial.state == TrialState.FAIL:  # not one that had ended before
+                queue_again(study, trial, lost=False)
             raise
         except (AssertionError, ValueError, UpdateFinishedTrialError) as error:
             # Optuna raises these for a result that comes too late, as after this machine slept; or a sampler fails.
             late = isinstance(error, UpdateFinishedTrialError)
-            if own is None or not (late or _find_trial(study, own).state == TrialState.FAIL):
+            if own is None or not (late or study.trials[own].state == TrialState.FAIL):
                 raise
             if interrupted:
                 raise KeyboardInterrupt from error
     return True
-
-
-def _find_trial(study: Study, number: int | None) -> FrozenTrial:
-    return next(trial for trial in study.get_trials(deepcopy=False) if trial.number == number)
 
 
 def run_in_processes(job: Job, total: int, on_end: Callable[[], None], workers: int) -> None:
