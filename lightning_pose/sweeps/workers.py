@@ -157,38 +157,41 @@ def run_in_processes(job: Job, total: int, on_end: Callable[[], None], workers: 
         RuntimeError: a worker broke; the others have finished their trials.
     """
     context = _process_context(workers)
-    left, ended = context.Semaphore(total), context.Semaphore(0)
+    left, ended = context.Semaphore(total), context.Semaphore(0)  # trials that no process has begun, that have ended
     study, storage = job.open()
-    missing, running, broken = min(workers, total), list[BaseProcess](), False
+    missing, running = min(workers, total), list[BaseProcess]()
     try:
-        while missing or running:
-            for _ in range(missing):
-                running.append(context.Process(target=_run_worker, args=(job, left, ended)))
-                running[-1].start()
-            wait([process.sentinel for process in running], POLL_SECONDS)
-            gone = [process for process in running if process.exitcode is not None]
-            running = [process for process in running if process not in gone]
-            while ended.acquire(block=False):
-                on_end()
-            if any(process.exitcode == 1 for process in gone) and not broken:
-                broken = True
-                print("the sweep breaks off; trials under way are finished first", file=sys.stderr, flush=True)
-                while left.acquire(block=False):
-                    pass
-            killed = [process for process in gone if process.exitcode not in (0, 1)]
-            if killed:
-                with lock_study(storage, job.study):
-                    queued, given_up = recover_trials(study, storage, MlflowClient(job.plan.tracking[0]))
-                for _ in range(queued + sum(process.exitcode == INTERRUPTED for process in killed)):
-                    left.release()
-                for _ in range(given_up):
+        try:
+            while missing or running:
+                for _ in range(missing):
+                    running.append(context.Process(target=_run_worker, args=(job, left, ended)))
+                    running[-1].start()
+                wait([process.sentinel for process in running], POLL_SECONDS)
+                gone = [process for process in running if process.exitcode is not None]
+                running = [process for process in running if process not in gone]
+                while ended.acquire(block=False):
                     on_end()
-            missing = 0 if broken else len(killed)
+                killed = [p for p in gone if p.exitcode == INTERRUPTED or (p.exitcode or 0) < 0]
+                if any(process.exitcode and process not in killed for process in gone):
+                    raise RuntimeError("a worker of the sweep broke; its traceback is above")
+                if killed:
+                    with lock_study(storage, job.study):
+                        queued, given_up = recover_trials(study, storage, MlflowClient(job.plan.tracking[0]))
+                    for _ in range(queued + sum(process.exitcode == INTERRUPTED for process in killed)):
+                        left.release()
+                    for _ in range(given_up):
+                        on_end()
+                missing = len(killed)
+        except Exception:
+            print("the sweep breaks off; trials under way are finished first", file=sys.stderr, flush=True)
+            while left.acquire(block=False):
+                pass
+            for process in running:
+                process.join()
+            raise
     except KeyboardInterrupt:
         _interrupt_workers(running)
         raise
-    if broken:
-        raise RuntimeError("a worker of the sweep broke; its traceback is above")
 
 
 def _run_worker(job: Job, left: Semaphore, ended: Semaphore) -> None:

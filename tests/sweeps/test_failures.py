@@ -77,18 +77,17 @@ class ExitOnce(Callback):
         time.sleep(0.5)
 
 
-def test_trials_under_way_are_finished_when_a_worker_breaks(
-    workplace: Workplace, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_trials_under_way_are_finished_when_a_worker_breaks(workplace: Workplace) -> None:
     breaker = {
         "class_path": "tests.sweeps.test_failures.ExitOnce",
         "init_args": {"marker": str(workplace.folder / "x")},
     }
     settings = {"trainer.callbacks": [breaker], "trainer.max_epochs": 1}
     file = write(workplace, sampler="grid", space={"model.units": [4, 5, 6, 7]}, settings=settings)
-    with pytest.raises(RuntimeError, match="a worker of the sweep broke"):
-        workplace.command("sweep", file, "--workers", "2")
-    assert "the sweep breaks off; trials under way are finished first" in capsys.readouterr().err
+    with workplace.start("sweep", file, "--workers", "2") as command:
+        _, errors = command.communicate(timeout=200)
+    assert "RuntimeError: a worker of the sweep broke" in errors
+    assert "the sweep breaks off; trials under way are finished first" in errors
     found = sorted(states(optuna.load_study(study_name=STUDY, storage=address(workplace))))
     assert found in (["COMPLETE", "RUNNING", "WAITING", "WAITING"], ["RUNNING", "WAITING", "WAITING", "WAITING"])
 
