@@ -15,11 +15,13 @@ import time
 from pathlib import Path
 
 import torch
-from lightning import Callback, LightningDataModule, Trainer
+from lightning import Callback, Trainer
 from lightning.pytorch.callbacks import Timer
 
 from lightning_pose import models
-from lightning_pose.data.batches import PoseBatch, PoseDataset, batch_loader
+from lightning_pose.checkpoint import Spec
+from lightning_pose.data import SceneDataModule
+from lightning_pose.data.batches import PoseBatch, PoseDataset, make_loader
 from lightning_pose.features import SURF
 from lightning_pose.geometry.quaternions import align_hemisphere, quat_normalize
 from lightning_pose.runs.checkpoints import BestCheckpoint, LastCheckpoint
@@ -29,14 +31,11 @@ from lightning_pose.runs.recorder import RunRecorder
 from lightning_pose.scenes.scene import Scene
 
 
-class RandomData(LightningDataModule):
+class RandomData(SceneDataModule):
     """Random descriptors and poses, served as the real data module serves real ones."""
 
     def __init__(self, frames: int, n_features: int, batch_size: int = 64) -> None:
-        super().__init__()
-        self.batch_size = batch_size
-        self.extractor = SURF(n_features)
-        self.scene = Scene("random", Path(), "random", ())
+        super().__init__(SURF(n_features), batch_size, batch_size, cache_dir=None, workers=None)
         self.train = PoseDataset(
             PoseBatch(
                 torch.randn(frames, n_features, 64),
@@ -46,17 +45,23 @@ class RandomData(LightningDataModule):
             )
         )
 
+    def _load_scene(self) -> Scene:
+        return Scene("random", Path(), "random", ())
+
+    def prepare_data(self) -> None:
+        """There is nothing to extract."""
+
     def dataset(self, split: str) -> PoseDataset:
         return self.train
 
     def train_dataloader(self):
-        return batch_loader(self.train, self.batch_size, shuffle=True)
+        return make_loader(self.train, self.batch_size, shuffle=True)
 
     def val_dataloader(self):
         return []
 
-    def describe(self) -> dict[str, str]:
-        return {"class_path": "benchmark"}
+    def describe(self) -> Spec:
+        return {"class_path": "benchmark", "init_args": {}}
 
 
 class EpochClock(Callback):
@@ -101,7 +106,7 @@ def bare(model: models.PoseModule, data: RandomData, epochs: int) -> float:
             start = time.perf_counter()
         for index in torch.randperm(len(train.frame)).split(batch_size):
             batch = PoseBatch(*(tensor[index] for tensor in train))
-            position_m, quat_raw = model._decode(batch.features)
+            position_m, quat_raw = model.decode_features(batch.features)
             target = align_hemisphere(batch.quat_wxyz, model.quat_reference)
             loss = model.loss(position_m, quat_raw, batch.position_m, target)["total"]
             optimizer.zero_grad()

@@ -1,6 +1,6 @@
-"""What checkpoints hold besides weights: objects as plain specs (class path, arguments), and reading the files.
+"""Checkpoint files, and the objects in them as plain specs (class path and arguments).
 
-A spec is what config files write: `describe` makes it from an object, `build` makes the object from it.
+A spec is what config files write: `describe_object` makes it from an object, `build_object` the object from it.
 `read_checkpoint` reads a file that `fit` wrote; class paths of older versions are replaced by today's.
 """
 
@@ -20,9 +20,9 @@ from lightning_pose.errors import CheckpointError
 __all__ = [
     "RENAMED_CLASSES",
     "Spec",
-    "build",
+    "build_object",
     "class_path",
-    "describe",
+    "describe_object",
     "read_checkpoint",
     "resolve_class_path",
     "resolve_class_paths",
@@ -59,16 +59,16 @@ RENAMED_CLASSES = {
     "lightning_pose.data.datamodules.clips.ClipDataModule": "lightning_pose.data.ClipDataModule",
     "lightning_pose.tracking.MLflowLogger": "lightning_pose.runs.logger.MLflowLogger",
 }
-"""Class paths that older checkpoints and configs have, to those of today. A path in here is never used again."""
+"""Class paths in older checkpoints and configs, to today's. A path that is listed here must never name a new class."""
 
 
 def resolve_class_path(path: str) -> str:
-    """Today's class path of a class that an older file names; the path itself where it was never renamed."""
+    """Today's class path for one in an older file; the path itself if it was never renamed."""
     return RENAMED_CLASSES.get(path, path)
 
 
-def resolve_class_paths(config: Any) -> Any:
-    """A config's or a spec's nested values, each class path replaced by today's.
+def resolve_class_paths(config: object) -> object:
+    """Copy a config's or a spec's nested values, with each class path replaced by today's.
 
     Configs name a class by `class_path` or by a bare string, as in `extractor: lightning_pose.features.SURF`.
     """
@@ -80,7 +80,7 @@ def resolve_class_paths(config: Any) -> Any:
 
 
 def class_path(obj: object) -> str:
-    """The path by which users import an object's class: that of the outermost package that exports it.
+    """The path by which users import an object's class: its name in the outermost package that exports it.
 
     `lightning_pose.models.SurfLSTM`, not `lightning_pose.models.surf_lstm.SurfLSTM`, so that files stay readable
     when a module moves. A class that no package exports is named by its module.
@@ -94,13 +94,13 @@ def class_path(obj: object) -> str:
     return f"{cls.__module__}.{cls.__qualname__}"
 
 
-def describe(obj: object) -> Spec:
-    """The spec of an object that keeps every constructor argument as an attribute of the same name."""
+def describe_object(obj: object) -> Spec:
+    """Make the spec of an object that keeps every constructor argument as an attribute of the same name."""
     names = inspect.signature(type(obj)).parameters
     return {"class_path": class_path(obj), "init_args": {name: getattr(obj, name) for name in names}}
 
 
-def build(spec: Mapping[str, Any]) -> Any:
+def build_object(spec: Mapping[str, Any]) -> Any:
     """Make the object that a spec describes.
 
     Raises:
@@ -119,7 +119,7 @@ def build(spec: Mapping[str, Any]) -> Any:
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
-    """A checkpoint's content, tensors memory-mapped on the CPU, classes by today's paths.
+    """Read a checkpoint that `fit` wrote: tensors are memory-mapped on the CPU, class paths are today's.
 
     Raises:
         CheckpointError: the file is missing, unreadable, or was not written by this project.
@@ -129,7 +129,7 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
         raise CheckpointError(f"{path} is no file; give a checkpoint such as mlruns/checkpoints/RUN_ID/best.ckpt")
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except Exception as error:  # torch raises half a dozen kinds for a file that is no checkpoint
+    except Exception as error:  # torch raises many kinds of exception for a file that is no checkpoint
         raise CheckpointError(
             f"{path} cannot be read as a checkpoint; it is damaged or another kind of file"
         ) from error

@@ -12,21 +12,22 @@ from typing import Any, NoReturn
 
 import torch
 import yaml
-from jsonargparse import DefaultHelpFormatter, get_loader, set_loader
-from lightning import LightningDataModule, Trainer
+from jsonargparse import DefaultHelpFormatter, Namespace, get_loader, set_loader
+from lightning import Trainer
 from lightning.pytorch.callbacks import Timer
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from lightning_pose.checkpoint import read_checkpoint, resolve_class_path, resolve_class_paths
+from lightning_pose.data import SceneDataModule, require_clips
 from lightning_pose.errors import CheckpointError, ConfigError
 from lightning_pose.evaluation.callback import TestReport
-from lightning_pose.localization.sequences import chain_test
-from lightning_pose.models import ClipModule, PoseModule
+from lightning_pose.localization.sequences import chain_test_split
+from lightning_pose.models import PoseModule
 from lightning_pose.paths import default_tracking_uri
 from lightning_pose.runs.checkpoints import BestCheckpoint, LastCheckpoint, checkpoint_folder
 from lightning_pose.runs.epoch_bar import EpochBar
-from lightning_pose.runs.logger import last_run
+from lightning_pose.runs.logger import find_last_run
 from lightning_pose.runs.recorder import RunRecorder
 from lightning_pose.scenes.trajectory_files import write_sequences
 
@@ -40,7 +41,7 @@ class _HelpFormatter(argparse.RawDescriptionHelpFormatter, DefaultHelpFormatter)
 PARSER_MODE = "yaml_with_renames"
 
 
-def load_with_renames(text: str) -> Any:
+def load_with_renames(text: str) -> object:
     """A YAML value in which classes have today's paths: a config's whole content, or one value of a command line."""
     return resolve_class_paths(get_loader("yaml")(text))
 
@@ -55,9 +56,9 @@ def _rename_value(word: str) -> str:
 
 
 class PoseParser(LightningArgumentParser):
-    """A parser that reads older class paths by today's, and raises ConfigError for a wrong setting.
+    """A parser that replaces older class paths by today's, and raises ConfigError for a wrong setting.
 
-    The error ends in one line like any other mistake of a user.
+    So a wrong setting ends in one line, as every mistake of a user does.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -80,7 +81,7 @@ NOISE = re.compile(
 
 
 def _one_line(message: str) -> str:
-    """jsonargparse's many lines without what it says of its own types: which setting, and what is wrong with it."""
+    """jsonargparse's message in one line, without its notes on types: which setting, and what is wrong with it."""
     lines = [NOISE.sub("", line).strip(" -") for line in message.splitlines()]
     text = " ".join(line for line in lines if line)
     text = re.sub(r"<class '([^']+)'>", r"\1", re.sub(r'Parser key "([^"]+)":', r"\1:", text))
@@ -121,15 +122,18 @@ The checkpoint knows its architecture and its data; both can be overridden.
 }
 
 
-def _help(verb: str) -> dict[str, Any]:
+PROGRAM = "python -m lightning_pose"
+
+
+def _parser_settings(verb: str) -> dict[str, str]:
     return {
-        "prog": f"python -m lightning_pose {verb}",
-        "usage": f"python -m lightning_pose {verb} --config FILE [--SETTING VALUE ...]",
+        "prog": f"{PROGRAM} {verb}",
+        "usage": f"{PROGRAM} {verb} --config FILE [--SETTING VALUE ...]",
         "description": HELP[verb],
     }
 
 
-def _quieten() -> None:
+def _quiet_lightning() -> None:
     """Drop messages of Lightning about devices, restored files and its own use of torch: no user can act on them."""
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.WARNING)
@@ -147,11 +151,13 @@ class PoseCLI(LightningCLI):
     """
 
     def __init__(self, args: list[str], run: bool = True) -> None:
-        _quieten()
+        _quiet_lightning()
         self.recorder = RunRecorder()
+        self.verb_parsers: dict[str, LightningArgumentParser] = {}
+        self._checkpoint: str | None = None
         super().__init__(
             model_class=PoseModule,
-            datamodule_class=LightningDataModule,
+            datamodule_class=SceneDataModule,
             subclass_mode_model=True,
             subclass_mode_data=True,
             save_config_callback=None,  # it asserts with a database logger; the recorder keeps the config
@@ -167,25 +173,30 @@ class PoseCLI(LightningCLI):
             auto_configure_optimizers=False,
             load_from_checkpoint_support=False,  # checkpoints carry their own plain settings
             parser_class=PoseParser,
-            parser_kwargs={verb: _help(verb) for verb in self.subcommands()} if run else _help("extract"),
+            parser_kwargs={verb: _parser_settings(verb) for verb in self.subcommands()}
+            if run
+            else _parser_settings("extract"),
             args=_with_saved_config(args) if run else args,
             run=run,
         )
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
+        self.verb_parsers[str(parser.prog).removeprefix(PROGRAM).strip()] = parser
         parser.link_arguments("data.input_shape", "model.init_args.input_shape", apply_on="instantiate")
         parser.add_lightning_class_args(BestCheckpoint, "best")
         parser.add_lightning_class_args(TestReport, "report")
 
-    def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
+    def parse_arguments(self, parser: LightningArgumentParser, args: list[str]) -> None:
         try:
             # Not Lightning's own, which warns that sys.argv is given as well.
             self.config = parser.parse_args([_rename_value(word) for word in args])
         except UnicodeDecodeError as error:
             raise ConfigError(f"the config is not text ({error}); give a YAML file") from error
-
-    def _parse_ckpt_path(self) -> None:
-        """Nothing: `_with_saved_config` has taken the settings out of the checkpoint already."""
+        if "subcommand" in self.config:
+            # Lightning would read a checkpoint named here, and add its hyperparameters to the config.
+            # `_with_saved_config` has added them already, so the name is put aside until then.
+            config = self.config[self.config.subcommand]
+            self._checkpoint, config.ckpt_path = config.ckpt_path, None
 
     def instantiate_classes(self) -> None:
         try:
@@ -198,6 +209,8 @@ class PoseCLI(LightningCLI):
         self.model.check_data(self.datamodule)
 
     def before_instantiate_classes(self) -> None:
+        if self.subcommand is not None:
+            self.config[self.subcommand].ckpt_path = self._checkpoint
         if self.subcommand in ("validate", "predict"):
             self.config[self.subcommand].trainer.logger = False  # a look at a checkpoint is no run
         elif self.subcommand == "test":
@@ -212,7 +225,7 @@ class PoseCLI(LightningCLI):
         logger = config.trainer.logger
         if not logger:
             raise ConfigError("trainer.logger is off, so no run is known; name the checkpoint in --ckpt_path")
-        run_id, checkpoint = last_run(
+        run_id, checkpoint = find_last_run(
             uri=logger.init_args.tracking_uri or default_tracking_uri(logger.init_args.root),
             experiment_name=logger.init_args.experiment_name,
             checkpoints=Path(config.trainer.default_root_dir) / "checkpoints",
@@ -223,8 +236,11 @@ class PoseCLI(LightningCLI):
         config.ckpt_path = str(checkpoint)
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
-        config = self.config if self.subcommand is None else self.config[self.subcommand]
-        self.recorder.config_yaml = self._parser(self.subcommand).dump(config, skip_unset=False)
+        if self.subcommand is None:
+            config, parser = self.config, self.parser
+        else:
+            config, parser = self.config[self.subcommand], self.verb_parsers[self.subcommand]
+        self.recorder.config_yaml = parser.dump(config, skip_unset=False)
         return super().instantiate_trainer(**kwargs)
 
     def after_fit(self) -> None:
@@ -233,13 +249,14 @@ class PoseCLI(LightningCLI):
         checkpoint = str(best) if best.is_file() else None
         self.trainer.test(self.model, datamodule=self.datamodule, ckpt_path=checkpoint, verbose=False)
 
-    def predict(self, model: PoseModule, datamodule: Any, **kwargs: Any) -> None:
+    def predict(self, model: PoseModule, datamodule: SceneDataModule, **kwargs: Any) -> None:
         """Write one TUM file a sequence of the test split."""
         scene = datamodule.scene
-        if isinstance(model, ClipModule):
+        if model.reads_clips:
             datamodule.prepare_data()
             model.load_state_dict(read_checkpoint(kwargs["ckpt_path"])["state_dict"])
-            rows, *poses = (torch.cat(parts) for parts in zip(*chain_test(model, datamodule), strict=True))
+            chained = chain_test_split(model, require_clips(datamodule))
+            rows, *poses = (torch.cat(parts) for parts in zip(*chained, strict=True))
             numbers = datamodule.dataset("test").data.frame[rows].tolist()
         else:
             poses = map(
@@ -261,8 +278,8 @@ class _OptionParser(argparse.ArgumentParser):
 def _with_saved_config(args: list[str]) -> list[str]:
     """Put the checkpoint's own settings into the command line of a verb that only reads it.
 
-    Its architecture replaces the config's, which may have other widths; its data settings serve where no config is
-    given. Options on the command line still win.
+    Its architecture replaces the config's, which may have other widths. Its data settings are used if no config is
+    given. Options on the command line have precedence.
     """
     parser = _OptionParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--ckpt_path")
@@ -301,7 +318,7 @@ def _check_architecture(checkpoint: str, saved: str, asked: str | None) -> None:
         )
 
 
-def _check_resumable(checkpoint: str, config: Any) -> None:
+def _check_resumable(checkpoint: str, config: Namespace) -> None:
     """Refuse a checkpoint that training cannot go on from, before a run is opened for it."""
     saved = read_checkpoint(checkpoint)
     _check_architecture(checkpoint, saved["lightning_pose"]["model"]["class_path"], config.model.class_path)

@@ -1,4 +1,4 @@
-"""The exceptions a user's mistake can raise; the command line turns each into one line and exit code 2."""
+"""Exceptions for mistakes of the user; the command line prints each as one line and exits with code 2."""
 
 __all__ = ["CacheError", "CheckpointError", "ConfigError", "DataError", "ImageError", "PoseError"]
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from lightning_pose.errors import ConfigError
@@ -20,7 +21,7 @@ Norm = Literal["plain", "squared"]
 
 @dataclass
 class LossConfig:
-    """Which pose loss; the defaults are the thesis's eq. 2.1 and 3.7.
+    """Settings of the pose loss; the defaults are the thesis's eq. 2.1 and 3.7.
 
     Eq. 4.4 is `form: split` with `orientation_weight` alpha; 5.3 the same with `normalize_quat`; 6.3 is
     `split`, `squared`, with `orientation_weight` beta; 6.2 adds `trajectory_weight: 1`.
@@ -32,8 +33,8 @@ class LossConfig:
         orientation_weight: how much the quaternion counts: the factor of its term in `split` (alpha and
             beta of the thesis), of its four elements in `joint`.
         trajectory_weight: for clips, the factor of the norm of the positions' summed error; 0 leaves it out.
-        learned_weights: learn the balance of position and orientation (Kendall & Cipolla, CVPR 2017);
-            `split` only, `orientation_weight` stays 1.
+        learned_weights: learn the weights of position and orientation (Kendall & Cipolla, CVPR 2017); needs
+            `split` and `orientation_weight` 1.
         normalize_quat: scale the predicted quaternion to unit length first.
 
     Raises:
@@ -65,10 +66,10 @@ class LossConfig:
 
 
 class PoseLoss(nn.Module):
-    """Position plus weighted orientation, as `LossConfig` says; each term a mean over batch and frames.
+    """Position error plus weighted orientation error (see `LossConfig`); each term is a mean over batch and frames.
 
     With learned weights the total is `L_p exp(-s_p) + s_p + L_q exp(-s_q) + s_q` (Kendall & Cipolla,
-    CVPR 2017), s_p and s_q starting at 0 and -3. Gradients are finite, zero, where an error is zero.
+    CVPR 2017); s_p starts at 0, s_q at -3. The gradient of an error of zero is zero.
 
     Args:
         config: the loss's form and weights.
@@ -81,18 +82,23 @@ class PoseLoss(nn.Module):
             self.log_scale_position = nn.Parameter(torch.tensor(0.0))
             self.log_scale_orientation = nn.Parameter(torch.tensor(-3.0))
 
-    def forward(self, position_hat: Tensor, quat_hat: Tensor, position: Tensor, quat: Tensor) -> dict[str, Tensor]:
-        """Compare predicted poses with true ones.
+    def forward(
+        self,
+        position_hat: Float[Tensor, "*predicted 3"],
+        quat_hat: Float[Tensor, "*predicted 4"],
+        position: Float[Tensor, "*true 3"],
+        quat: Float[Tensor, "*true 4"],
+    ) -> dict[str, Float[Tensor, ""]]:
+        """The loss of predicted poses, and its terms.
 
         Args:
-            position_hat: (..., 3) predicted; (B, T, 3) for clips.
-            quat_hat: (..., 4) predicted wxyz, as the network gives it.
-            position: (..., 3) true.
-            quat: (..., 4) true wxyz, unit, on one hemisphere.
+            position_hat: predicted; (B, T, 3) for clips.
+            quat_hat: predicted wxyz, as the network returns it.
+            position: true, of the same shape.
+            quat: true wxyz, unit, in one hemisphere.
 
         Returns:
-            Scalars: `position` and `orientation`, unweighted; `trajectory`, unweighted, where it has a
-            weight; and `total`.
+            `position` and `orientation`, unweighted; `trajectory`, unweighted, if it has a weight; and `total`.
 
         Raises:
             ConfigError: shapes differ, or there is a trajectory weight but no time axis.
@@ -122,16 +128,17 @@ class PoseLoss(nn.Module):
         return {**terms, "total": total}
 
     def _norm(self, error: Tensor) -> Tensor:
+        """Norm of errors (..., D), plain or squared as configured: (...)."""
         if self.config.norm == "squared":
             return error.square().sum(-1)
-        # Its gradient at 0 is 0, where the square root of a sum of squares has NaN.
+        # Its gradient at 0 is 0; that of the square root of a sum of squares is NaN.
         return torch.linalg.vector_norm(error, dim=-1)
 
     def _trajectory(self, error_p: Tensor) -> Tensor:
-        """The norm of the summed position error per frame.
+        """Norm of the position error summed over a clip's T frames, divided by T.
 
-        Eq. 6.2 sums its position and orientation terms over the clip's T frames where we take the mean;
-        dividing this term by T as well keeps the thesis's proportions, so the total is eq. 6.2 over T.
+        Eq. 6.2 sums its position and orientation terms over the T frames; here they are means. With this term divided
+        by T as well, the total is eq. 6.2 divided by T.
         """
         if error_p.dim() < 3:
             raise ConfigError(

@@ -1,4 +1,4 @@
-"""Where the project keeps what it can make again: features and synthetic rooms."""
+"""Default places of files: caches of features and synthetic rooms, and the MLflow database."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["STORE_VARIABLE", "cache_folder", "default_tracking_uri"]
 
 
 def cache_folder(name: str) -> Path:
-    """`name` in `$LIGHTNING_POSE_CACHE`, or else in the user's cache folder (`~/.cache/lightning_pose`)."""
+    """The folder `name` in `$LIGHTNING_POSE_CACHE`, or else in the user's cache folder (`~/.cache/lightning_pose`)."""
     base = os.environ.get("LIGHTNING_POSE_CACHE")
     return (Path(base).expanduser() if base else user_cache_path("lightning_pose", appauthor=False)) / name
 
@@ -20,5 +20,5 @@ STORE_VARIABLE = "MLFLOW_TRACKING_URI"
 
 
 def default_tracking_uri(root: str | Path = "mlruns") -> str:
-    """`MLFLOW_TRACKING_URI`, or a database under `root`."""
+    """`MLFLOW_TRACKING_URI` if it is set, or else the address of an SQLite database in the folder `root`."""
     return os.environ.get(STORE_VARIABLE) or f"sqlite:///{Path(root) / 'mlflow.db'}"

@@ -1,4 +1,4 @@
-"""Tables for the terminal, on their side where that is too narrow for them."""
+"""Tables for the terminal; a table that is too wide for it is printed with rows and columns exchanged."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rich.table import Table
 
 __all__ = ["Sheet"]
 
-UNKNOWN_WIDTH = 120  # of a file, or of whatever reads the output
+UNKNOWN_WIDTH = 120  # characters; for output into a file or another process
 
 
 @dataclass(frozen=True)
@@ -20,10 +20,10 @@ class Sheet:
     """A table of plain text.
 
     Attributes:
-        title: above it.
-        heads: of the columns.
-        rows: as many cells each as there are heads.
-        caption: below it.
+        title: line above the table.
+        heads: heads of the columns.
+        rows: rows of cells, one cell for each head.
+        caption: line below the table.
     """
 
     title: str
@@ -32,19 +32,20 @@ class Sheet:
     caption: str | None = None
 
     def show(self, width: int | None = None) -> None:
-        """Print it, a column for each row where it would not fit otherwise.
+        """Print the table; exchange rows and columns if only then it fits.
 
         Args:
-            width: of the terminal in characters, if it is not to be found out.
+            width: of the terminal in characters; by default it is found out.
         """
         console = Console(width=width or (None if sys.stdout.isatty() else UNKNOWN_WIDTH))
         columns = list(zip(self.heads, *self.rows, strict=True))
-        upright = _least_width([[*head.split(), *cells] for head, *cells in columns])
-        lying = _least_width([[word for head in self.heads for word in head.split()], *self.rows])
-        on_side = upright > console.width >= lying
-        console.print(self._table(None, columns) if on_side else self._table(self.heads, self.rows))
+        usual = _find_least_width([[*head.split(), *cells] for head, *cells in columns])
+        exchanged = _find_least_width([[word for head in self.heads for word in head.split()], *self.rows])
+        exchange = usual > console.width >= exchanged
+        console.print(self._table(None, columns) if exchange else self._table(self.heads, self.rows))
 
     def _table(self, heads: Sequence[str] | None, rows: Sequence[Sequence[str]]) -> Table:
+        """Make a table of these rows; without `heads` the first column holds them, aligned left."""
         caption = None if self.caption is None else escape(self.caption)
         table = Table(
             title=escape(self.title),
@@ -61,6 +62,6 @@ class Sheet:
         return table
 
 
-def _least_width(columns: Sequence[Sequence[str]]) -> int:
-    """Of a table that breaks none of these words and numbers."""
+def _find_least_width(columns: Sequence[Sequence[str]]) -> int:
+    """Width in characters of a table whose columns hold these texts, none of them broken into lines."""
     return 1 + sum(3 + max(map(len, column), default=0) for column in columns)

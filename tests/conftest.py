@@ -15,6 +15,13 @@ if TYPE_CHECKING:  # they take seconds to import, and most tests do without
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported: each test process has one core
 
 
+def pytest_configure() -> None:
+    """Check shapes in signatures; before a test imports the modules."""
+    from tests import shapes
+
+    shapes.turn_on_checks()
+
+
 @pytest.fixture(autouse=True, scope="session")
 def _hermetic(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from lightning_pose.checkpoint import RENAMED_CLASSES, build, class_path, describe, resolve_class_paths
+from lightning_pose.checkpoint import RENAMED_CLASSES, build_object, class_path, describe_object, resolve_class_paths
 from lightning_pose.errors import CheckpointError
 from lightning_pose.features import SURF
 from lightning_pose.localization.localizer import Localizer
@@ -19,9 +19,9 @@ from tests.helpers import Thumbnails
 
 
 def test_a_description_is_plain_and_rebuilds() -> None:
-    spec = describe(Thumbnails(rows=3, columns=4))
+    spec = describe_object(Thumbnails(rows=3, columns=4))
     assert spec == {"class_path": "tests.helpers.Thumbnails", "init_args": {"rows": 3, "columns": 4}}
-    rebuilt = build(spec)
+    rebuilt = build_object(spec)
     assert isinstance(rebuilt, Thumbnails)
     assert rebuilt.feature_shape == (3, 4)
 
@@ -31,7 +31,7 @@ def test_class_path_of_a_builtin() -> None:
 
 
 @pytest.mark.parametrize(
-    ("path", "init_args", "says"),
+    ("path", "init_args", "message"),
     [
         ("nowhere.Thing", {}, "nowhere.Thing cannot be imported .*; install"),
         ("tests.helpers.Thing", {}, "tests.helpers.Thing cannot be imported .*; install"),
@@ -39,9 +39,9 @@ def test_class_path_of_a_builtin() -> None:
         ("tests.helpers.Thumbnails", {"height": 3}, "does not take .*height.*; it was saved by another version"),
     ],
 )
-def test_what_cannot_be_rebuilt_is_refused(path: str, init_args: dict[str, Any], says: str) -> None:
-    with pytest.raises(CheckpointError, match=says):
-        build({"class_path": path, "init_args": init_args})
+def test_what_cannot_be_rebuilt_is_refused(path: str, init_args: dict[str, Any], message: str) -> None:
+    with pytest.raises(CheckpointError, match=message):
+        build_object({"class_path": path, "init_args": init_args})
 
 
 CHECKPOINTS = Path(__file__).parent / "checkpoints"

@@ -1,4 +1,4 @@
-"""The verb `extract`: fill the feature cache that a config needs, without training."""
+"""The command `extract`: fills the feature cache that a config needs, without training."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ __all__ = ["main"]
 
 
 def main(argv: list[str]) -> int:
-    """Extract the features of every frame of the config's scene; what is cached already is kept."""
+    """Extract the features of every frame of the config's scene that are not cached yet; return the exit code."""
     datamodule = PoseCLI(argv, run=False).datamodule
     report = datamodule.fill()
     print(

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
+from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from lightning_pose.commands.parser import VerbParser
 from lightning_pose.errors import ConfigError
+from lightning_pose.metrics.catalog import reference_baseline
 from lightning_pose.paths import default_tracking_uri
 from lightning_pose.reports.choose_run import PICKS
+
+if TYPE_CHECKING:
+    from lightning_pose.reports.table import Report
 
 __all__ = ["main"]
 
@@ -34,7 +40,7 @@ left in MLflow.
 RULES = """Several runs of a system on a scene are joined by --pick:
 
   best     the run with the lowest validation error (val/position_median_m, else val/loss, of its best epoch, or of its
-           last where it does not tell that one). Test errors never choose. Where no run has one, the newest.
+           last where it lacks that). Test errors never choose. Where no run has one, the newest.
   latest   the newest run
   spread   mean and standard deviation over runs that differ in nothing but seed_everything (and in the folder of the
            same data); others are refused, or get rows of their own with --by NAME
@@ -54,10 +60,10 @@ def main(argv: list[str]) -> int:
     Raises:
         ConfigError: an option does not do, there is no store, no run is left, or runs do not compare.
     """
-    args = _parser().parse_args(argv)
+    args = _build_parser().parse_args(argv)
     # Only now, so that `--help` is there at once.
     from lightning_pose.reports.baseline_rows import add_baselines
-    from lightning_pose.reports.filters import Filters, read_date, select_runs
+    from lightning_pose.reports.filters import Filters, select_runs
     from lightning_pose.reports.published_rows import add_published
     from lightning_pose.reports.table import build_report
     from lightning_pose.runs.reader import read_runs
@@ -65,15 +71,15 @@ def main(argv: list[str]) -> int:
     if args.chapter and not args.published:
         raise ConfigError("--chapter chooses among published rows; give --published as well")
     filters = Filters(
-        experiment=args.experiment,
-        systems=tuple(args.system),
-        scenes=tuple(args.scene),
-        tags=tuple(_pair(text) for text in args.tag),
-        since=read_date(args.since) if args.since else None,
-        until=read_date(args.until, end=True) if args.until else None,
+        experiments=[args.experiment] if args.experiment else [],
+        systems=args.system,
+        scenes=args.scene,
+        tags=[_split_tag(text) for text in args.tag],
+        since=args.since,
+        until=args.until,
         trials=args.trials,
     )
-    form = args.format or _form_of(args.out)
+    form = args.format or _choose_format(args.out)
     uri = args.tracking_uri or default_tracking_uri()
     runs, notes = select_runs(read_runs(uri), filters)
     report = build_report(runs, args.pick, tuple(dict.fromkeys(args.by)))
@@ -82,69 +88,52 @@ def main(argv: list[str]) -> int:
         add_baselines(report)
     if args.published:
         add_published(report, args.chapter)
-    if args.skill or args.costs:
-        report.notes += _about_columns(args, len(report.scenes))
-    _write(report, form, args)
+    report.further = tuple(name for name in ("skill", "costs") if getattr(args, name))
+    if args.skill:
+        images, clips = reference_baseline(clips=False), reference_baseline(clips=True)
+        report.notes.append(f"skill is model error over that of {images} ({clips} for clips); below 1, learning helped")
+    if report.further and len(report.scenes) > 1:
+        report.notes.append("skill and costs are means over the scenes of a row")
+    _write_report(report, form, args.out)
     return 0
 
 
-def _about_columns(args: argparse.Namespace, scenes: int) -> list[str]:
-    notes = []
-    if args.skill:
-        notes.append("skill is model error over that of retrieval_top1 (no_motion for clips); below 1, learning helped")
-    if scenes > 1:
-        notes.append("skill and costs are means over the scenes of a row")
-    return notes
-
-
-def _write(report: object, form: str, args: argparse.Namespace) -> None:
+def _write_report(report: Report, form: str, out: Path | None) -> None:
     from lightning_pose.reports.data_formats import as_csv, as_json
-    from lightning_pose.reports.table import Report
-    from lightning_pose.reports.text_formats import Shown, as_latex, as_markdown, print_table
+    from lightning_pose.reports.text_formats import as_latex, as_markdown, print_table
 
-    assert isinstance(report, Report)
-    shown = Shown(args.costs, args.skill)
-    out: Path | None = args.out
-    if form == "table" and out is None:
-        print_table(report, shown)
-        return
-    if form in ("csv", "latex"):
-        for note in (*report.notes, *report.footnotes):
-            print(f"note: {note}", file=sys.stderr)
-    text = {
-        "markdown": lambda: as_markdown(report, shown),
-        "latex": lambda: as_latex(report, shown),
-        "csv": lambda: as_csv(report),
-        "json": lambda: as_json(report),
-    }
-    if out is None:
-        print(text[form]())
-        return
+    writers = {"markdown": as_markdown, "latex": as_latex, "csv": as_csv, "json": as_json}
+    for note in (*report.notes, *report.footnotes) if form in ("csv", "latex") else ():
+        print(f"note: {note}", file=sys.stderr)
     try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        with out.open("w", encoding="utf-8") as file:
+        if out is not None:
+            out.parent.mkdir(parents=True, exist_ok=True)
+        with nullcontext(sys.stdout) if out is None else out.open("w", encoding="utf-8") as file:
             if form == "table":
-                print_table(report, shown, file)
+                print_table(report, file)
             else:
-                file.write(text[form]() + "\n")
+                print(writers[form](report), file=file)
     except OSError as error:
+        if out is None:
+            raise
         raise ConfigError(f"--out {out} cannot be written ({error.strerror}); give a file's name") from error
-    print(f"{out}", file=sys.stderr)
+    if out is not None:
+        print(out, file=sys.stderr)
 
 
-def _form_of(out: Path | None) -> str:
+def _choose_format(out: Path | None) -> str:
     """The format that a file's name asks for; a table otherwise."""
     return next((form for form, suffix in FORMATS.items() if out is not None and out.suffix == suffix), "table")
 
 
-def _pair(text: str) -> tuple[str, str]:
+def _split_tag(text: str) -> tuple[str, str]:
     name, equals, value = text.partition("=")
     if not name or not equals:
         raise ConfigError(f"--tag {text} has no value; give NAME=VALUE, such as split=official or model.units=100")
     return name, value
 
 
-def _parser() -> VerbParser:
+def _build_parser() -> VerbParser:
     parser = VerbParser(
         "report",
         usage="python -m lightning_pose report [--format FORMAT] [--scene NAME ...] [--by NAME ...] [--published] ...",
@@ -152,6 +141,7 @@ def _parser() -> VerbParser:
         epilog=RULES,
     )
     add = parser.add_argument
+    add_several = partial(parser.add_argument, action="append", default=[])
     add("--format", choices=FORMATS, help="default: what --out ends with (.md .tex .csv .json), or table")
     add("--out", metavar="FILE", type=Path, help="write it there")
     add(
@@ -160,15 +150,13 @@ def _parser() -> VerbParser:
         help="MLflow store (default: MLFLOW_TRACKING_URI, or sqlite:///mlruns/mlflow.db)",
     )
     add("--pick", choices=PICKS, default="best", help="how runs of one cell are joined (default: %(default)s)")
-    add("--by", metavar="NAME", action="append", default=[], help="a row for each value of a setting (repeatable)")
+    add_several("--by", metavar="NAME", help="a row for each value of a setting (repeatable)")
     add("--experiment", metavar="NAME", help="only this MLflow experiment")
-    add("--system", metavar="NAME", action="append", default=[], help="only this architecture (repeatable)")
-    add("--scene", metavar="NAME", action="append", default=[], help="only this scene (repeatable)")
-    add(
+    add_several("--system", metavar="NAME", help="only this architecture (repeatable)")
+    add_several("--scene", metavar="NAME", help="only this scene (repeatable)")
+    add_several(
         "--tag",
         metavar="NAME=VALUE",
-        action="append",
-        default=[],
         help="only runs with this tag or setting, such as data.extractor.backbone=resnet50 (repeatable; values of one "
         "name are alternatives)",
     )
@@ -179,13 +167,11 @@ def _parser() -> VerbParser:
     add("--skill", action="store_true", help="a column: model error over that of retrieval")
     add("--costs", action="store_true", help="columns: parameters, seconds of training, ms and bytes a frame")
     add("--published", action="store_true", help="rows of published tables for the scenes on show, marked as such")
-    add(
+    add_several(
         "--chapter",
         metavar="2..6",
         type=int,
         choices=range(2, 7),
-        action="append",
-        default=[],
         help="only published rows of this chapter of the thesis (repeatable)",
     )
     return parser

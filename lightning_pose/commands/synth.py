@@ -1,4 +1,4 @@
-"""The verb `synth`: renders a synthetic room as a dataset, for trying things out where no data is at hand."""
+"""The command `synth`: renders a synthetic room as a dataset, for users who have no data yet."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ EPILOG = """examples:
 
 
 def main(argv: list[str]) -> int:
-    """Run the verb with the arguments after its name; returns the exit code."""
-    args = _parser().parse_args(argv)
+    """Run the command with the arguments after its name; return the exit code."""
+    args = _build_synth_parser().parse_args(argv)
     columns = (TextColumn("rendering"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, transient=True) as bar:
         task = bar.add_task("rendering", total=args.frames)
@@ -35,7 +35,7 @@ def main(argv: list[str]) -> int:
     return 0
 
 
-def _parser() -> VerbParser:
+def _build_synth_parser() -> VerbParser:
     parser = VerbParser(
         "synth",
         description=DESCRIPTION,
@@ -44,12 +44,12 @@ def _parser() -> VerbParser:
     parser.add_argument("dir", metavar="DIR", type=Path, help="folder to write; its parents are made")
     parser.add_argument("--seed", metavar="N", type=int, default=0, help="which room (default: 0)")
     parser.add_argument("--frames", metavar="M", type=int, default=300, help="images over all sequences (default: 300)")
-    parser.add_argument("--size", metavar="WxH", type=_size, default=(320, 240), help="default: 320x240")
+    parser.add_argument("--size", metavar="WxH", type=_parse_size, default=(320, 240), help="default: 320x240")
     return parser
 
 
-def _size(text: str) -> tuple[int, int]:
-    """WxH as two numbers."""
+def _parse_size(text: str) -> tuple[int, int]:
+    """Width and height from a text WxH, in pixels."""
     try:
         width, height = (int(part) for part in text.lower().split("x"))
     except ValueError:

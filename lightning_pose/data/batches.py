@@ -1,4 +1,4 @@
-"""What models are fed: batches of features and poses, cut by index from tensors that live in memory."""
+"""Batches of features and poses, cut by index from tensors in memory."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-__all__ = ["DrawnDataset", "PoseBatch", "PoseDataset", "batch_loader"]
+__all__ = ["DrawnDataset", "PoseBatch", "PoseDataset", "make_loader"]
 
 
 class PoseBatch(NamedTuple):
@@ -29,7 +29,11 @@ class PoseBatch(NamedTuple):
 
 
 class PoseDataset(Dataset[PoseBatch]):
-    """One split in memory. Indexing by a list gives the whole batch in one gather, without collating."""
+    """One split in memory. A list of indices returns a whole batch in one gather, without collating.
+
+    Attributes:
+        data: the split frame by frame, whatever its items are: features (M, ...) and poses in the world.
+    """
 
     def __init__(self, data: PoseBatch) -> None:
         self.data = data
@@ -43,9 +47,13 @@ class PoseDataset(Dataset[PoseBatch]):
     def __getitems__(self, indices: Sequence[int]) -> PoseBatch:
         return PoseBatch(*(tensor[list(indices)] for tensor in self.data))
 
+    def targets(self) -> tuple[Tensor, Tensor]:
+        """Positions and quaternions of all items, as batches have them: (M, 3) and (M, 4) of M frames."""
+        return self.data.position_m, self.data.quat_wxyz
+
 
 class DrawnDataset(PoseDataset):
-    """One split with more features a frame than a batch has: each time, another draw of them, in their order.
+    """One split with more features per frame than a batch has; each access draws some at random, in their order.
 
     Args:
         data: features (F, M, D), strongest first.
@@ -66,10 +74,11 @@ class DrawnDataset(PoseDataset):
         return batch._replace(features=batch.features[torch.arange(frames)[:, None], drawn])
 
 
-def _as_is(batch: Any) -> PoseBatch:
+def _keep_batch(batch: Any) -> PoseBatch:
+    """Collate nothing: `__getitems__` has returned a whole batch."""
     return batch
 
 
-def batch_loader(dataset: Dataset[PoseBatch], batch_size: int, shuffle: bool) -> DataLoader[PoseBatch]:
+def make_loader(dataset: Dataset[PoseBatch], batch_size: int, shuffle: bool) -> DataLoader[PoseBatch]:
     """A DataLoader whose batches come from `__getitems__`; Lightning can still shard it over processes."""
-    return DataLoader(dataset, batch_size=batch_size, shuffle=shuffle, collate_fn=_as_is)
+    return DataLoader(dataset, batch_size=batch_size, shuffle=shuffle, collate_fn=_keep_batch)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar, cast
 
 from torch.utils.data import DataLoader
 
-from lightning_pose.data.batches import PoseBatch, batch_loader
+from lightning_pose.data.batches import PoseBatch, make_loader
 from lightning_pose.data.clip_dataset import Augmentation, ClipDataset, ClipShape, find_runs
 from lightning_pose.data.datamodule import SceneDataModule, room_folder
 from lightning_pose.errors import ConfigError
@@ -18,7 +18,7 @@ from lightning_pose.scenes.combine import join_scenes
 from lightning_pose.scenes.formats import load_scene
 from lightning_pose.scenes.scene import Scene
 
-__all__ = ["ClipDataModule"]
+__all__ = ["ClipDataModule", "require_clips"]
 
 LONGEST = 400
 """Frames of the longest clip that the thesis tests."""
@@ -27,9 +27,9 @@ LONGEST = 400
 class ClipDataModule(SceneDataModule):
     """Clips of T consecutive frames of one sequence, with poses relative to each clip's first frame (eq. 6.1).
 
-    Scenes to train and to test on are named apart, so that a network can be tested where it has never been: a scene
-    that is only tested on gives its official test split, or all of its frames if it has none. With nothing named,
-    it trains on synthetic rooms and tests on another.
+    Scenes to train and to test on are given separately, so that a network can be tested on scenes that it was not
+    trained on. A scene that is only for testing gives its official test split, or all of its frames if it has none.
+    Without scenes, training is on synthetic rooms and the test on another.
 
     Args:
         extractor: what the networks read of each frame, such as `lightning_pose.features.SURF`.
@@ -42,7 +42,7 @@ class ClipDataModule(SceneDataModule):
         hop: from the first frame of a clip to that of the next; by default clips share one frame, so that they chain.
             In training clips begin up to a hop later, at random.
         relative_frame: axes of relative positions: `camera`, the first camera's, or `world`, as eq. 6.1 has them,
-            which no network can know in a scene that it has not seen.
+            which no network can infer in a scene that it was not trained on.
         max_stride: in training, take every k-th frame, k drawn up to this, so that the camera moves faster than it did;
             1 or `stride` for none.
         reverse: in training, play half of the clips backwards.
@@ -126,8 +126,12 @@ class ClipDataModule(SceneDataModule):
     def _load(self, roots: Sequence[str | Path]) -> list[Scene]:
         return [load_scene(root, self.format, self.val_fraction, val_block=self._shape.span) for root in roots]
 
+    def dataset(self, split: str) -> ClipDataset:
+        """One of `train`, `val`, `test` as clips, without augmentation."""
+        return cast(ClipDataset, super().dataset(split))
+
     def _make_dataset(self, split: str, data: PoseBatch) -> ClipDataset:
-        return self._clips(split, data, self._shape)
+        return self._cut_clips(split, data, self._shape)
 
     def clips(self, split: str, length: int) -> ClipDataset:
         """A split's clips of another length.
@@ -135,27 +139,45 @@ class ClipDataModule(SceneDataModule):
         Raises:
             DataError: no run of consecutive frames is that long.
         """
-        return self._clips(split, self.dataset(split).data, ClipShape(length, self.stride))
+        return self._cut_clips(split, self.dataset(split).data, ClipShape(length, self.stride))
 
     def longest_clip(self, split: str) -> int:
         """The most frames that a clip of a split can have."""
         runs = find_runs(self.scene, self.scene.splits[split])
         return max(((len(run) - 1) // self.stride + 1 for run in runs), default=0)
 
-    def _clips(self, split: str, data: PoseBatch, shape: ClipShape, **settings: Any) -> ClipDataset:
+    def _cut_clips(
+        self, split: str, data: PoseBatch, shape: ClipShape, augmentation: Augmentation | None = None
+    ) -> ClipDataset:
         runs = find_runs(self.scene, self.scene.splits[split])
-        return ClipDataset(data, runs, shape, self.relative_frame, **settings)
+        return ClipDataset(data, runs, shape, self.relative_frame, augmentation)
 
     def train_dataloader(self) -> DataLoader[PoseBatch]:
         data = self.dataset("train").data
-        clips = self._clips("train", data, self._shape, augmentation=self._augmentation())
-        return batch_loader(clips, self.batch_size, shuffle=True)
+        clips = self._cut_clips("train", data, self._shape, self._augmentation())
+        return make_loader(clips, self.batch_size, shuffle=True)
 
     def _augmentation(self) -> Augmentation:
+        """The random changes to training clips that the settings ask for."""
         return Augmentation(True, self.max_stride, self.reverse, self.extractor.mirror if self.mirror else None)
 
 
+def require_clips(datamodule: SceneDataModule) -> ClipDataModule:
+    """The same data module, as one of clips.
+
+    Raises:
+        ConfigError: it gives single images.
+    """
+    if not isinstance(datamodule, ClipDataModule):
+        raise ConfigError(
+            f"{type(datamodule).__name__} gives images, not clips; set data.class_path to "
+            "lightning_pose.data.ClipDataModule"
+        )
+    return datamodule
+
+
 def _check_named_once(root: str | None, train_scenes: list[str] | None, test_scenes: list[str] | None) -> None:
+    """Raise ConfigError if scenes are named in two ways, or none to train on."""
     if root is not None and (train_scenes or test_scenes):
         raise ConfigError("data.root is one scene, and data.train_scenes and data.test_scenes are several; give either")
     if test_scenes is not None and not train_scenes:

@@ -1,4 +1,4 @@
-"""Clips: windows of T consecutive frames of one sequence, cut by index from frames that lie in memory once."""
+"""Clips: windows of T consecutive frames of one sequence, cut by index from frames that are in memory once."""
 
 from __future__ import annotations
 
@@ -9,14 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import Dataset
 
-from lightning_pose.data.batches import PoseBatch
+from lightning_pose.data.batches import PoseBatch, PoseDataset
 from lightning_pose.errors import ConfigError, DataError
 from lightning_pose.geometry.relative import RelativeFrame, relative_poses
 from lightning_pose.scenes.scene import Scene
 
-__all__ = ["Augmentation", "ClipDataset", "ClipShape", "find_runs", "mirrored_poses"]
+__all__ = ["Augmentation", "ClipDataset", "ClipShape", "find_runs", "mirror_poses"]
 
 _log = logging.getLogger("lightning_pose")
 
@@ -63,14 +62,14 @@ class ClipShape:
 
 @dataclass(frozen=True)
 class Augmentation:
-    """What training clips go through, each clip at random.
+    """Random changes to training clips, drawn for each clip.
 
     Attributes:
         wander: begin up to a hop later.
         max_stride: take every k-th frame, k from the clips' stride up to this where the run is long enough, so that
-            the camera moves faster than it did.
+            the camera moves faster than in the recording.
         reverse: play half of the clips backwards.
-        mirror: what turns (..., features) into those of the mirrored images, for half of the clips.
+        mirror: turns (..., features) into those of the mirrored images, for half of the clips.
     """
 
     wander: bool = False
@@ -80,7 +79,7 @@ class Augmentation:
 
 
 def find_runs(scene: Scene, indices: np.ndarray) -> list[np.ndarray]:
-    """Rows of `indices` that follow each other in one sequence, with no frame of another split between them.
+    """Find the rows of `indices` that follow each other in one sequence, with no frame of another split between.
 
     Args:
         scene: whose frames of a sequence are consecutive.
@@ -96,10 +95,10 @@ def find_runs(scene: Scene, indices: np.ndarray) -> list[np.ndarray]:
     return np.split(np.arange(len(indices)), breaks)
 
 
-def mirrored_poses(position_m: Tensor, quat_wxyz: Tensor) -> tuple[Tensor, Tensor]:
+def mirror_poses(position_m: Tensor, quat_wxyz: Tensor) -> tuple[Tensor, Tensor]:
     """Poses of the cameras that see the mirrored images, in the world mirrored at x = 0.
 
-    A mirrored image is what a camera sees in a mirrored world: with S = diag(-1, 1, 1), x becomes S x and R becomes
+    A mirrored image is the image of a camera in a mirrored world: with S = diag(-1, 1, 1), x becomes S x and R becomes
     S R S.
 
     Args:
@@ -109,7 +108,7 @@ def mirrored_poses(position_m: Tensor, quat_wxyz: Tensor) -> tuple[Tensor, Tenso
     return position_m * position_m.new_tensor([-1.0, 1, 1]), quat_wxyz * quat_wxyz.new_tensor([1.0, 1, -1, -1])
 
 
-class ClipDataset(Dataset[PoseBatch]):
+class ClipDataset(PoseDataset):
     """Clips of one split. Indexing by a list gives the whole batch in one gather: frames are shared, not copied.
 
     A batch has features (B, T, ...), poses relative to each clip's first frame (B, T, 3) and (B, T, 4), and frames
@@ -120,7 +119,7 @@ class ClipDataset(Dataset[PoseBatch]):
         runs: rows of `data` that follow each other, as from `find_runs`.
         shape: how clips are cut.
         relative_frame: as for `relative_poses`.
-        augmentation: what training clips go through; nothing if not given.
+        augmentation: random changes to clips; none if not given.
 
     Raises:
         DataError: no run is as long as a clip.
@@ -134,7 +133,7 @@ class ClipDataset(Dataset[PoseBatch]):
         relative_frame: RelativeFrame = "camera",
         augmentation: Augmentation | None = None,
     ) -> None:
-        self.data = data
+        super().__init__(data)
         self.runs = list(runs)
         self.shape = shape
         self.relative_frame: RelativeFrame = relative_frame
@@ -169,7 +168,7 @@ class ClipDataset(Dataset[PoseBatch]):
         if self.augmentation.mirror is not None:
             chosen = torch.rand(len(rows)) < 0.5
             features[chosen] = self.augmentation.mirror(features[chosen])
-            position_m[chosen], quat_wxyz[chosen] = mirrored_poses(position_m[chosen], quat_wxyz[chosen])
+            position_m[chosen], quat_wxyz[chosen] = mirror_poses(position_m[chosen], quat_wxyz[chosen])
         return PoseBatch(features, *relative_poses(position_m, quat_wxyz, self.relative_frame), frame)
 
     def _rows(self, starts: Tensor, ends: Tensor) -> Tensor:

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
-from lightning import LightningDataModule
+from lightning import LightningDataModule, Trainer
 from torch.utils.data import DataLoader
 
-from lightning_pose.checkpoint import describe
-from lightning_pose.data.batches import PoseBatch, PoseDataset, batch_loader
+from lightning_pose.checkpoint import Spec, describe_object
+from lightning_pose.data.batches import PoseBatch, PoseDataset, make_loader
 from lightning_pose.errors import ConfigError, DataError
 from lightning_pose.features import FeatureCache, FeatureExtractor
 from lightning_pose.features.cache import FillReport
@@ -20,7 +20,7 @@ from lightning_pose.paths import cache_folder
 from lightning_pose.scenes.scene import Scene
 from lightning_pose.scenes.synthetic import RENDERER_VERSION, render_room
 
-__all__ = ["SceneDataModule", "room_folder"]
+__all__ = ["SceneDataModule", "find_datamodule", "room_folder", "scene_datamodule"]
 
 
 def room_folder(seed: int, frames: int) -> Path:
@@ -30,10 +30,11 @@ def room_folder(seed: int, frames: int) -> Path:
 
 
 class SceneDataModule(LightningDataModule):
-    """Scene -> cached features -> batches; of clips where `gives_clips` says so.
+    """Base class of the data modules: one scene, its cached features, and batches of them.
 
-    A child gives `_load_scene`, `train_dataloader`, and `_make_dataset` where a split is more than its frames. It
-    keeps every constructor argument as an attribute of the same name.
+    A subclass defines `_load_scene` and `train_dataloader`. If its items are not single frames, it also overrides
+    `_make_dataset`, and sets `gives_clips` if they are clips. It keeps every constructor argument as an attribute of
+    the same name.
 
     Args:
         extractor: what the networks read, such as `lightning_pose.features.SURF`.
@@ -48,6 +49,7 @@ class SceneDataModule(LightningDataModule):
     """
 
     gives_clips: ClassVar[bool] = False
+    """Whether an item is a clip (T, ...) of consecutive frames, with poses relative to its first frame."""
 
     def __init__(
         self,
@@ -68,7 +70,7 @@ class SceneDataModule(LightningDataModule):
         self.workers = workers
         self.cache = FeatureCache(extractor, cache_dir)
         self._scene: Scene | None = None
-        self._datasets: dict[str, Any] = {}
+        self._datasets: dict[str, PoseDataset] = {}
 
     @abstractmethod
     def _load_scene(self) -> Scene:
@@ -94,25 +96,27 @@ class SceneDataModule(LightningDataModule):
         used = sorted({int(i) for indices in self.scene.splits.values() for i in indices})
         return self.cache.fill([self.scene.frames[i].image for i in used], workers=self.workers)
 
-    def dataset(self, split: str) -> Any:
-        """One of `train`, `val`, `test`, its features in memory; `data` holds them frame by frame."""
+    def dataset(self, split: str) -> PoseDataset:
+        """One of `train`, `val`, `test`, its features in memory."""
         if split not in self._datasets:
             self._datasets[split] = self._make_dataset(split, self._read(split, self.cache))
         return self._datasets[split]
 
-    def _make_dataset(self, split: str, data: PoseBatch) -> Any:
+    def _make_dataset(self, split: str, data: PoseBatch) -> PoseDataset:
+        """Items of a split, from its frames."""
         return PoseDataset(data)
 
     def _read(self, split: str, cache: FeatureCache) -> PoseBatch:
+        """All frames of a split, features from a cache."""
         frames = [self.scene.frames[i] for i in self.scene.splits[split]]
         return PoseBatch(
             features=torch.from_numpy(cache.features([frame.image for frame in frames], workers=self.workers)),
-            position_m=_stack([frame.position_m for frame in frames], 3),
-            quat_wxyz=_stack([frame.quat_wxyz for frame in frames], 4),
+            position_m=_stack_rows([frame.position_m for frame in frames], 3),
+            quat_wxyz=_stack_rows([frame.quat_wxyz for frame in frames], 4),
             frame=torch.as_tensor(self.scene.splits[split], dtype=torch.int64),
         )
 
-    def val_dataloader(self) -> DataLoader[PoseBatch] | list[Any]:
+    def val_dataloader(self) -> DataLoader[PoseBatch] | list[DataLoader[PoseBatch]]:
         if len(self.scene.splits["val"]):
             return self._eval_loader("val")
         if self.trainer is not None and self.trainer.validating:
@@ -127,14 +131,37 @@ class SceneDataModule(LightningDataModule):
     predict_dataloader = test_dataloader
 
     def _eval_loader(self, split: str) -> DataLoader[PoseBatch]:
-        return batch_loader(self.dataset(split), self.eval_batch_size, shuffle=False)
+        return make_loader(self.dataset(split), self.eval_batch_size, shuffle=False)
 
-    def describe(self) -> dict[str, Any]:
+    def describe(self) -> Spec:
         """Plain settings that rebuild this data module; checkpoints carry them."""
-        spec = describe(self)
-        spec["init_args"]["extractor"] = describe(self.extractor)
+        spec = describe_object(self)
+        spec["init_args"]["extractor"] = describe_object(self.extractor)
         return spec
 
 
-def _stack(rows: list[np.ndarray], width: int) -> torch.Tensor:
+def _stack_rows(rows: list[np.ndarray], width: int) -> torch.Tensor:
+    """(N, width) float32 of N rows, also of none."""
     return torch.from_numpy(np.asarray(rows, dtype=np.float32).reshape(-1, width))
+
+
+def find_datamodule(trainer: Trainer) -> SceneDataModule | None:
+    """The trainer's data module; None if it has none, or one that is no `SceneDataModule`."""
+    datamodule = getattr(trainer, "datamodule", None)  # Lightning does not declare the attribute
+    return datamodule if isinstance(datamodule, SceneDataModule) else None
+
+
+def scene_datamodule(trainer: Trainer) -> SceneDataModule:
+    """The trainer's data module.
+
+    Raises:
+        ConfigError: the trainer has none, or one that is no `SceneDataModule`.
+    """
+    datamodule = find_datamodule(trainer)
+    if datamodule is None:
+        given = getattr(trainer, "datamodule", None)
+        raise ConfigError(
+            f"the trainer's data module is {'missing' if given is None else 'a ' + type(given).__name__}; give it "
+            "datamodule=, such as lightning_pose.data.ImageDataModule"
+        )
+    return datamodule

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from torch.utils.data import DataLoader
 
-from lightning_pose.data.batches import DrawnDataset, PoseBatch, batch_loader
+from lightning_pose.data.batches import DrawnDataset, PoseBatch, make_loader
 from lightning_pose.data.datamodule import SceneDataModule, room_folder
 from lightning_pose.errors import ConfigError
 from lightning_pose.features import FeatureCache, FeatureExtractor, LocalExtractor
@@ -59,7 +59,7 @@ class ImageDataModule(SceneDataModule):
         self.format = format
         self.val_fraction = val_fraction
         self.feature_pool = feature_pool
-        self._pool = None if feature_pool is None else _pooled(extractor, feature_pool)
+        self._pool = None if feature_pool is None else _widen_extractor(extractor, feature_pool)
         self.room_seed = room_seed
         self.room_frames = room_frames
 
@@ -72,11 +72,11 @@ class ImageDataModule(SceneDataModule):
         if self._pool is not None:
             pool = self._read("train", FeatureCache(self._pool, self.cache_dir))
             train = DrawnDataset(pool, self.input_shape[0])
-        return batch_loader(train, self.batch_size, shuffle=True)
+        return make_loader(train, self.batch_size, shuffle=True)
 
 
-def _pooled(extractor: FeatureExtractor, times: float) -> LocalExtractor:
-    """The extractor with so many times its features a frame, out of the same cache."""
+def _widen_extractor(extractor: FeatureExtractor, times: float) -> LocalExtractor:
+    """The extractor with so many times its features per frame, out of the same cache."""
     if not isinstance(extractor, LocalExtractor):
         raise ConfigError(f"data.feature_pool needs local features, and {extractor.name} has none; leave it out")
     if not times >= 1:

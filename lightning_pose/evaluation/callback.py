@@ -1,21 +1,20 @@
-"""The callback that ends every test: baselines beside the model, costs, figures, prediction files, and one table."""
+"""The callback that ends every test with baselines, costs, figures, prediction files, and one table."""
 
 from __future__ import annotations
 
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
 
+from lightning_pose.data.datamodule import scene_datamodule
 from lightning_pose.evaluation.clips import evaluate_clips
 from lightning_pose.evaluation.images import evaluate_images
 from lightning_pose.evaluation.result import Evaluation
 from lightning_pose.evaluation.table import print_results, results_markdown
 from lightning_pose.models.base import Pose, PoseModule
-from lightning_pose.models.clip import ClipModule
 from lightning_pose.runs.checkpoints import checkpoint_folder, run_logger
 from lightning_pose.runs.logger import MLflowLogger, log_localizer
 from lightning_pose.runs.tags import NOTE
@@ -26,7 +25,7 @@ __all__ = ["TestReport", "describe_run"]
 
 
 class TestReport(Callback):
-    """Gathers the test's predictions and, at its end, logs and prints all that belongs beside them.
+    """Collects the test's predictions and, at its end, evaluates them, logs the results and prints a table.
 
     Args:
         log_model: keep a model in the run that `mlflow.pyfunc.load_model` loads.
@@ -46,7 +45,7 @@ class TestReport(Callback):
         self._poses = []
 
     def on_test_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, *args: Any, **kwargs: Any
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Pose, *args: object, **kwargs: object
     ) -> None:
         self._poses.append(Pose(*(tensor.float().cpu() for tensor in outputs)))
 
@@ -58,19 +57,19 @@ class TestReport(Callback):
             for name, value in trainer.callback_metrics.items()
             if name.startswith("test/")
         }
-        if isinstance(pl_module, ClipModule):
+        assert isinstance(pl_module, PoseModule)
+        if pl_module.reads_clips:
             found = evaluate_clips(trainer, pl_module, model, self.visual_odometry)
         else:
-            assert isinstance(pl_module, PoseModule)
             found = evaluate_images(trainer, pl_module, self._poses, model)
         self.evaluation = found
         self.results = {type(pl_module).__name__: model, **found.baselines}
-        scene = trainer.datamodule.scene  # type: ignore[attr-defined]
+        scene = scene_datamodule(trainer).scene
         print_results(self.results, f"{scene.name}, {pl_module.headline}", found.extras)
         logger = run_logger(trainer)
         if logger is None:
             return
-        _log(logger, found)
+        _log_evaluation(logger, found)
         describe_run(logger, results_markdown(self.results, found.extras))
         best = checkpoint_folder(trainer) / "best.ckpt"
         if self.log_model and best.is_file():
@@ -78,8 +77,8 @@ class TestReport(Callback):
         print(f"run {logger.run_id} in {logger.uri}")
 
 
-def _log(logger: MLflowLogger, found: Evaluation) -> None:
-    """Keep an evaluation in the run."""
+def _log_evaluation(logger: MLflowLogger, found: Evaluation) -> None:
+    """Write an evaluation's metrics, curves, trajectories and figures to the run."""
     logger.log_metrics(
         found.extras | {f"baseline/{k}/{name}": v for k, r in found.baselines.items() for name, v in r.items()}
     )
@@ -100,6 +99,7 @@ def describe_run(logger: MLflowLogger, text: str) -> None:
 
 
 def _log_trajectories(logger: MLflowLogger, trajectories: Mapping[str, tuple[list[Frame], Pose]]) -> None:
+    """Write one TUM file per sequence to the run, in a folder for each kind of trajectory."""
     with tempfile.TemporaryDirectory() as folder:
         for name, (frames, pose) in trajectories.items():
             write_sequences(Path(folder) / name, frames, pose.position_m.numpy(), pose.quat_wxyz.numpy())

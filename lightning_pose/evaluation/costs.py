@@ -1,35 +1,36 @@
-"""What a localizer costs: to train, to keep, and for each frame."""
+"""Costs of a localizer: training time, file size, parameters, and time per frame."""
 
 from __future__ import annotations
 
 import statistics
 import time
 from collections.abc import Callable
-from typing import Any
 
 import torch
-from lightning import LightningModule, Trainer
+from lightning import Trainer
 from torch import nn
 
+from lightning_pose.data.datamodule import SceneDataModule, scene_datamodule
+from lightning_pose.models.base import PoseModule
 from lightning_pose.runs.checkpoints import checkpoint_folder
-from lightning_pose.runs.recorder import train_seconds
+from lightning_pose.runs.recorder import read_train_seconds
 
 __all__ = ["costs", "count_layers"]
 
 
 def costs(
-    trainer: Trainer, module: LightningModule, frames: int = 1, split: str = "test", features: bool = True
+    trainer: Trainer, module: PoseModule, frames: int = 1, split: str = "test", features: bool = True
 ) -> dict[str, float]:
-    """What the localizer costs: to train, to keep, and per frame, features and network apart.
+    """Measure the localizer's costs, features and network apart, as metrics `cost/...`.
 
     Args:
         trainer: after a test, or after training.
         module: the model.
-        frames: how many frames the model is shown at a time.
+        frames: how many frames the model reads at a time: 1, or the length of a clip.
         split: whose frames the time is measured on.
-        features: extract a few frames again, to know how long that takes.
+        features: extract a few frames again, to measure how long that takes.
     """
-    datamodule = trainer.datamodule  # type: ignore[attr-defined]
+    datamodule = scene_datamodule(trainer)
     held = datamodule.dataset(split).data.features
 
     def locate(i: int) -> None:
@@ -37,17 +38,17 @@ def costs(
         module(shown.to(module.device))
 
     found = {
-        "cost/parameters": float(sum(p.numel() for p in module.network.parameters())),  # type: ignore[union-attr]
-        "cost/layers": float(count_layers(module.network)),  # type: ignore[arg-type]
-        "cost/ms_per_frame": _milliseconds(locate, len(held) - frames + 1) / frames,
+        "cost/parameters": float(sum(p.numel() for p in module.network.parameters())),
+        "cost/layers": float(count_layers(module.network)),
+        "cost/ms_per_frame": _time_median(locate, len(held) - frames + 1) / frames,
         "cost/frame_bytes": float(held[0].numel() * held.element_size()),
     }
     if features:
-        found["cost/features_ms_per_frame"] = _features_milliseconds(datamodule, split)
+        found["cost/features_ms_per_frame"] = _time_features(datamodule, split)
     best = checkpoint_folder(trainer) / "best.ckpt"
     if best.is_file():
         found["cost/checkpoint_bytes"] = float(best.stat().st_size)
-    seconds = train_seconds(trainer)
+    seconds = read_train_seconds(trainer)
     return found | ({"cost/train_seconds": seconds} if seconds else {})
 
 
@@ -63,14 +64,15 @@ def count_layers(module: nn.Module) -> int:
     return own + sum(count_layers(child) for child in module.children())
 
 
-def _features_milliseconds(datamodule: Any, split: str) -> float:
+def _time_features(datamodule: SceneDataModule, split: str) -> float:
+    """Milliseconds to read and extract one frame."""
     extractor, scene = datamodule.extractor, datamodule.scene
     files = [scene.frames[i].image for i in scene.splits[split][:10]]
-    return _milliseconds(lambda i: extractor.extract([extractor.read(files[i])]), len(files))
+    return _time_median(lambda i: extractor.extract([extractor.read(files[i])]), len(files))
 
 
-def _milliseconds(work: Callable[[int], Any], count: int, most: int = 30) -> float:
-    """Median time of one call, after one that warms up."""
+def _time_median(work: Callable[[int], object], count: int, most: int = 30) -> float:
+    """Median milliseconds of a call with 0, 1, ..., after one that warms up."""
     times = []
     with torch.inference_mode():
         work(0)

@@ -1,23 +1,21 @@
-"""What the first layers of a clip model respond to."""
+"""Responses of the first layers of a model of clips."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from lightning_pose.models.clip import ClipModule
+from lightning_pose.models.base import PoseModule
 
-__all__ = ["layer_responses"]
+__all__ = ["record_responses"]
 
 
 @torch.no_grad()
-def layer_responses(model: ClipModule, clip: Tensor, layers: int = 2) -> dict[str, Tensor]:
-    """What the first convolutions of a network answer to one clip (thesis, fig. 6.5).
+def record_responses(model: PoseModule, clip: Tensor, layers: int = 2) -> dict[str, Tensor]:
+    """Outputs of a network's first convolutions and activations for one clip (thesis, fig. 6.5).
 
     Args:
-        model: in any mode.
+        model: of clips, in any mode.
         clip: (T, *input_shape).
         layers: how many convolutions.
 
@@ -30,8 +28,8 @@ def layer_responses(model: ClipModule, clip: Tensor, layers: int = 2) -> dict[st
         chosen = [module for module in model.network.modules() if isinstance(module, kind)][:layers]
         for number, module in enumerate(chosen, 1):
 
-            def keep(_: nn.Module, __: Any, out: Tensor, name: str = f"{name} {number}") -> None:
-                # Conv3d answers (1, C, T, H, W), Conv2d over frames (T, C, H, W).
+            def keep(_: nn.Module, __: object, out: Tensor, name: str = f"{name} {number}") -> None:
+                # Conv3d returns (1, C, T, H, W), Conv2d over frames (T, C, H, W).
                 found[name] = (out[0].transpose(0, 1) if out.ndim == 5 else out).clone().cpu()
 
             handles.append(module.register_forward_hook(keep))

@@ -1,4 +1,4 @@
-"""An evaluation: everything that a test says beside the model's own metrics."""
+"""The result of a test beside the model's own metrics: baselines, costs, curves, trajectories, figures."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from matplotlib.figure import Figure
 
+from lightning_pose.metrics.catalog import MEDIANS, SKILLS
 from lightning_pose.models.base import Pose
 from lightning_pose.scenes.scene import Frame
 
@@ -33,8 +34,8 @@ class Evaluation:
 
 
 def skill(model: Mapping[str, float], baseline: Mapping[str, float]) -> dict[str, float]:
-    """Model error over a baseline's: below 1, learning helped."""
-    pairs = {"test/skill_position": "position_median_m", "test/skill_orientation": "orientation_median_deg"}
+    """The model's median errors divided by a baseline's, as `test/skill_*`; below 1, the model is better."""
     return {
-        name: model[metric] / baseline[metric] if baseline[metric] else float("inf") for name, metric in pairs.items()
+        f"test/{name}": model[metric] / baseline[metric] if baseline[metric] else float("inf")
+        for name, metric in zip(SKILLS, MEDIANS, strict=True)
     }

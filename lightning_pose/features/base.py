@@ -16,22 +16,22 @@ from lightning_pose.scenes.images import read_gray, read_rgb
 __all__ = ["MIN_STORED_FEATURES", "FeatureExtractor", "LocalExtractor", "Record"]
 
 Record = dict[str, np.ndarray]
-"""What an extractor says of one image: arrays by name."""
+"""What an extractor computes from one image: arrays by name."""
 
 MIN_STORED_FEATURES = 300
 """The cache keeps at least this many local features, so that a smaller N never extracts again."""
 
 
 class FeatureExtractor(ABC):
-    """Turns images into arrays; everything downstream (cache, data modules, models) sees only this.
+    """Turns images into arrays. Cache, data modules and models use extractors through this class only.
 
     To add an extractor, subclass it and give
 
-    - `color`: whether `extract` wants `gray` (H, W) or `rgb` (H, W, 3) uint8 images;
+    - `color`: whether `extract` takes `gray` (H, W) or `rgb` (H, W, 3) uint8 images;
     - `primary`: the name of the array that the networks read;
     - `settings`: everything that changes the stored arrays, in plain types (it keys the cache);
     - `feature_shape`: the shape that `features` returns for one image, and `dtype` if it is not float32;
-    - `extract`: the work itself, deterministic, for images that may differ in size;
+    - `extract`: the computation, deterministic, for images that may differ in size;
     - `features`: only where the networks do not read the stored primary array as it is.
 
     Constructor arguments must be plain types, so that a config file can name the extractor.
@@ -49,7 +49,7 @@ class FeatureExtractor(ABC):
     @property
     @abstractmethod
     def settings(self) -> Mapping[str, str | int | float | bool | None]:
-        """Whatever changes the stored arrays."""
+        """Everything that changes the stored arrays, in plain types."""
 
     @property
     @abstractmethod
@@ -57,7 +57,7 @@ class FeatureExtractor(ABC):
         """Shape of one image's features as the networks read them."""
 
     def read(self, path: str | Path) -> np.ndarray:
-        """One image file as `extract` wants it.
+        """Read an image file as `extract` takes it.
 
         Raises:
             ImageError: the file is missing or cannot be read.
@@ -69,29 +69,29 @@ class FeatureExtractor(ABC):
         """Compute one record per image."""
 
     def features(self, record: Record) -> np.ndarray:
-        """What the networks read, out of one stored record: of `feature_shape` and `dtype`."""
+        """The array that networks read, of `feature_shape` and `dtype`, from one stored record."""
         return record[self.primary]
 
     def appearance(self, features: Tensor) -> Tensor:
-        """What image retrieval compares, out of (B, *feature_shape): all of it, unless more was appended."""
+        """The part of features (B, *feature_shape) that image retrieval compares; here all of it."""
         return features
 
     def check_mirror(self) -> None:
-        """Refuse an extractor that has no `mirror`.
+        """Raise an error if the extractor has no `mirror`.
 
         Raises:
-            ConfigError: the features of a mirrored image do not follow from those of the image.
+            ConfigError: the features of a mirrored image cannot be computed from those of the image.
         """
         if type(self).mirror is FeatureExtractor.mirror:
             raise ConfigError(f"data.mirror is on, but {self.name} features cannot be mirrored; turn it off")
 
     def mirror(self, features: Tensor) -> Tensor:
-        """Features (..., *feature_shape) of the images mirrored left to right, from those of the images."""
+        """Features (..., *feature_shape) of images mirrored left to right, computed from those of the images."""
         raise NotImplementedError
 
 
 class LocalExtractor(FeatureExtractor):
-    """Keypoints with descriptors, strongest first; each record holds
+    """Base of extractors of keypoints with descriptors, strongest first. Each record holds
 
     - `descriptors`: (M, D) float32, L2-normalised, sorted by response, zero rows at the end;
     - `keypoints`: (M, 5) float32: x, y, size (pixels), response, angle (degrees), zero rows at the end;
@@ -136,15 +136,15 @@ class LocalExtractor(FeatureExtractor):
         rows = record["descriptors"][: self.n_features]
         if not self.with_geometry:
             return rows
-        return np.concatenate([rows, _geometry(record)[: self.n_features]], axis=1, dtype=np.float32)
+        return np.concatenate([rows, _compute_geometry(record)[: self.n_features]], axis=1, dtype=np.float32)
 
     def appearance(self, features: Tensor) -> Tensor:
-        """The descriptors without their geometry, whose scale would drown them."""
+        """The descriptors without their geometry, whose larger values would outweigh them."""
         return features[..., : self.descriptor_dim]
 
 
-def _geometry(record: Record) -> np.ndarray:
-    """(M, 4) float32: x, y in -1..1 (y by half the height), log size, and log response below the strongest."""
+def _compute_geometry(record: Record) -> np.ndarray:
+    """(M, 4) float32: x and y in -1..1 by half the width and height, log size, and log of response by the strongest."""
     x, y, size, response = record["keypoints"][:, :4].T
     real = np.arange(len(x)) < record["count"]
     half_w, half_h = np.maximum(record["image_size"] / 2, 0.5)

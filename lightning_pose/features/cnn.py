@@ -1,4 +1,4 @@
-"""Features of frozen pretrained CNNs: one pooled vector an image, or the map it was pooled from."""
+"""Features of frozen pretrained CNNs: one pooled vector per image, or the map before pooling."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
+from torch.nn.utils import convert_conv2d_weight_memory_format
 
 from lightning_pose.errors import ConfigError, ImageError
 from lightning_pose.features.backbones import BACKBONES, Backbone, build_backbone, check_backbone
@@ -23,27 +24,27 @@ __all__ = ["CNN"]
 Output = Literal["vector", "map"]
 Crop = Literal["center", "whole"]
 
-_RESIZE = 256 / 224  # shorter side over crop, with which all these CNNs were tested on ImageNet
-_LOADING = threading.Lock()  # the module's, so that an extractor can be copied and pickled
+_RESIZE = 256 / 224  # shorter side of the resized image by side of the crop, in the ImageNet tests of all these CNNs
+_LOADING = threading.Lock()  # not an attribute, so that an extractor can be copied and pickled
 
 
 class CNN(FeatureExtractor):
     """A frozen CNN's last feature map (C, h, w), or its mean over all cells, (C,).
 
     A record holds `features`: float32 for a vector, float16 for a map, which is large (ResNet50's 7 x 7 x 2048
-    are 200 kB). The network is loaded by the first call of `extract` and runs on the GPU where there is one,
-    there in half precision.
+    are 200 kB). The network is loaded by the first call of `extract` and runs on the GPU if there is one, in
+    half precision.
 
     Args:
         backbone: a name of `lightning_pose.features.backbones.BACKBONES`, or the class path of any
-            `torch.nn.Module` that keeps the contract of `build_backbone`.
+            `torch.nn.Module` that fulfils what `build_backbone` asks of it.
         weights: `imagenet`, `places365`, `none` or the path of a checkpoint, as for `build_backbone`.
         output: `vector` or `map`.
-        size: side of the square image that the network sees; by default the one it was trained with
+        size: side of the square image that the network gets; by default that of its training images
             (224; 299 for inception_v3).
-        crop: `center` cuts the square out of the middle, after the shorter side was resized to 256/224 of it,
-            as the networks were tested on ImageNet; `whole` squeezes the whole frame into it, so that nothing is
-            lost, and maps have one shape whatever that of the images.
+        crop: `center` resizes the shorter side to 256/224 of the square and cuts out the middle, as in the networks'
+            ImageNet tests; `whole` resizes the whole frame to the square, whatever its aspect ratio, so that no part
+            is lost.
 
     Raises:
         ConfigError: an unknown backbone, output or crop, or a size too small for the network.
@@ -82,9 +83,9 @@ class CNN(FeatureExtractor):
 
     @cached_property
     def settings(self) -> Mapping[str, str | int | float | bool | None]:
-        """What was asked for; weights of the user's own by a digest of them, so that a moved file is still cached."""
+        """The arguments; weights of the user's own are replaced by a digest, so that a moved file is still cached."""
         if self.backbone not in BACKBONES:
-            weights = _digest_of_state(self._network)
+            weights = _hash_weights(self._network)
         elif Path(self.weights).is_file():
             weights = hashlib.blake2b(Path(self.weights).read_bytes(), digest_size=8).hexdigest()
         else:
@@ -99,15 +100,16 @@ class CNN(FeatureExtractor):
 
     @cached_property
     def feature_shape(self) -> tuple[int, ...]:
-        """(C,) or (C, h, w); for named backbones it follows from the layers alone, before any weights are read.
+        """(C,) or (C, h, w); of a backbone in `BACKBONES` it is computed without reading weights.
 
         Raises:
-            ConfigError: the size is too small for the network, or it breaks the contract of `build_backbone`.
+            ConfigError: the size is too small for the network, or the network returns another shape than
+                `build_backbone` asks for.
         """
         if self.backbone in BACKBONES:
             network, device = Backbone(self.backbone).eval(), torch.device("cpu")
         else:
-            network, device = self._network, _device()
+            network, device = self._network, _choose_device()
         rgb = torch.zeros(1, 3, self._side, self._side, device=device)
         try:
             shape = tuple(self._run(network, rgb).shape[1:])
@@ -135,9 +137,9 @@ class CNN(FeatureExtractor):
                 raise ImageError(f"image {i} has shape {image.shape} and type {image.dtype}; give (H, W, 3) uint8 RGB")
         if not images:
             return []
-        _ = self.feature_shape  # refuses a size or a network that cannot work
+        _ = self.feature_shape  # raises an error if size or network do not work
         rgb = torch.stack([self._prepare(image) for image in images])
-        rgb = rgb.to(_device(), memory_format=torch.channels_last)
+        rgb = rgb.to(_choose_device(), memory_format=torch.channels_last)
         stored = torch.float16 if self.output == "map" else torch.float32
         return [{"features": row.numpy()} for row in self._run(self._network, rgb).to("cpu", stored)]
 
@@ -146,16 +148,17 @@ class CNN(FeatureExtractor):
 
     @property
     def _side(self) -> int:
+        """Side of the square image that the network gets, in pixels."""
         return self.size or BACKBONES.get(self.backbone, BACKBONES["resnet50"]).size
 
     @property
     def _network(self) -> nn.Module:
+        """The CNN, which is built by the first call."""
         with _LOADING:  # the cache extracts with several threads
             if self._loaded is None:
-                network = build_backbone(self.backbone, self.weights).eval().requires_grad_(False).to(_device())
-                # The layout that convolutions prefer: a sixth less time for EfficientNet-Lite0 on a CPU.
-                network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
-                self._loaded = network
+                network = build_backbone(self.backbone, self.weights).eval().requires_grad_(False).to(_choose_device())
+                # In this layout convolutions are faster: a sixth less time for EfficientNet-Lite0 on a CPU.
+                self._loaded = convert_conv2d_weight_memory_format(network, torch.channels_last)
             return self._loaded
 
     def _prepare(self, image: np.ndarray) -> Tensor:
@@ -164,9 +167,9 @@ class CNN(FeatureExtractor):
         height, width = image.shape[:2]
         rgb = torch.from_numpy(image).permute(2, 0, 1)[None].float() / 255
         if self.crop == "whole":
-            return _resize(rgb, side, side)[0]
+            return _resize_images(rgb, side, side)[0]
         scale = round(side * _RESIZE) / min(height, width)
-        rgb = _resize(rgb, round(height * scale), round(width * scale))
+        rgb = _resize_images(rgb, round(height * scale), round(width * scale))
         top, left = (rgb.shape[2] - side) // 2, (rgb.shape[3] - side) // 2
         return rgb[0, :, top : top + side, left : left + side]
 
@@ -178,15 +181,18 @@ class CNN(FeatureExtractor):
         return out.float().mean((2, 3)) if self.output == "vector" and out.ndim == 4 else out
 
 
-def _resize(rgb: Tensor, height: int, width: int) -> Tensor:
+def _resize_images(rgb: Tensor, height: int, width: int) -> Tensor:
+    """Resize images (B, 3, H, W) by bilinear interpolation with antialiasing."""
     return F.interpolate(rgb, (height, width), mode="bilinear", antialias=True)
 
 
-def _device() -> torch.device:
+def _choose_device() -> torch.device:
+    """The GPU if there is one, else the CPU."""
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
-def _digest_of_state(network: nn.Module) -> str:
+def _hash_weights(network: nn.Module) -> str:
+    """Digest of the names and values of all parameters and buffers."""
     digest = hashlib.blake2b(digest_size=8)
     for name, value in network.state_dict().items():
         digest.update(name.encode() + value.cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes())

@@ -13,7 +13,7 @@ from lightning_pose.features.cache import FeatureCache
 
 __all__ = ["FrameKeypoints", "measure_keypoints", "read_frame_keypoints"]
 
-SAMPLE = 100  # frames, evenly spread: a histogram needs no more, and thousands of descriptors a frame are a megabyte
+SAMPLE = 100  # images, evenly spread: enough for a histogram, and an image with thousands of descriptors is a megabyte
 BINS, RANKS = 25, 100
 COUNTS, RESPONSES = "features/count_histogram", "features/response_by_rank"
 STATISTICS = {"mean": np.mean, "median": np.median, "min": np.min, "max": np.max}
@@ -27,7 +27,7 @@ class FrameKeypoints(NamedTuple):
     Attributes:
         scene: name of its scene.
         image: its file.
-        keypoints: (count, 5): x, y, size, response, angle, strongest first.
+        keypoints: (count, 5): x, y, size, response, angle; strongest first.
     """
 
     scene: str
@@ -36,7 +36,7 @@ class FrameKeypoints(NamedTuple):
 
 
 def measure_keypoints(cache: FeatureCache, images: Sequence[Path], most: int) -> tuple[dict[str, float], Curves]:
-    """Count the keypoints of up to 100 evenly spread images, and average their responses.
+    """Count the keypoints of up to 100 evenly spread images, and compute their mean responses.
 
     Args:
         cache: of a `LocalExtractor`.
@@ -44,13 +44,13 @@ def measure_keypoints(cache: FeatureCache, images: Sequence[Path], most: int) ->
         most: the extractor's `n_features`, the largest count that an image can have.
 
     Returns:
-        Metrics: `features/count_mean`, `_median`, `_min` and `_max` of keypoints an image. Curves:
-        `features/count_histogram`, the share of images by the lowest count of their bin, and
+        Metrics: `features/count_mean`, `_median`, `_min` and `_max` of keypoints per image. Curves:
+        `features/count_histogram`, the fraction of images by the lowest count of their bin, and
         `features/response_by_rank`, the mean response of the strongest keypoint (1), the second (2), and so on, over
-        the images that have as many.
+        the images that have so many keypoints.
     """
     chosen = np.unique(np.linspace(0, len(images) - 1, min(SAMPLE, len(images))).round().astype(int))
-    # Descriptors are dropped at once: thousands of them an image would fill the memory.
+    # Descriptors are not kept: with thousands of them per image they would fill the memory.
     records = [
         {name: record[name] for name in ("count", "keypoints")}
         for record in cache.records([images[i] for i in chosen], progress=False)
@@ -61,20 +61,21 @@ def measure_keypoints(cache: FeatureCache, images: Sequence[Path], most: int) ->
 
 
 def read_frame_keypoints(cache: FeatureCache, scene: str, images: Sequence[Path]) -> FrameKeypoints:
-    """Return the middle one of a scene's images with its keypoints."""
+    """Read the keypoints of the middle one of a scene's images."""
     image = images[len(images) // 2]
     (record,) = cache.records([image], progress=False)
     return FrameKeypoints(scene, image, record["keypoints"][: int(record["count"])])
 
 
 def _compute_histogram(counts: np.ndarray, most: int) -> dict[int, float]:
-    """Return the share of images in equally wide bins from 0 to `most`, by the bins' lower edges."""
+    """Fraction of images in bins of equal width from 0 to `most`, by the lower edge of the bin."""
     width = max(1, -(-most // BINS))
     held = np.bincount(counts // width, minlength=most // width + 1)
     return {int(i * width): float(share) for i, share in enumerate(held / len(counts))}
 
 
 def _average_responses(records: Sequence[Record], counts: np.ndarray) -> dict[int, float]:
+    """Mean response of the keypoints of each rank, counted from 1, of the images that have so many keypoints."""
     means = {}
     for rank in range(min(int(counts.max()), RANKS)):
         held = [record["keypoints"][rank, 3] for record, count in zip(records, counts, strict=True) if count > rank]

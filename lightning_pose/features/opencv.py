@@ -1,4 +1,4 @@
-"""The features that the thesis compares SURF with (fig. 3.5): SIFT, ORB, FREAK and BRIEF, by OpenCV."""
+"""The features with which the thesis compares SURF (fig. 3.5): SIFT, ORB, FREAK and BRIEF, by OpenCV."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ __all__ = ["BRIEF", "FREAK", "ORB", "SIFT"]
 Settings = Mapping[str, str | int | float | bool | None]
 Describe = Callable[[np.ndarray], tuple[Sequence[cv2.KeyPoint], np.ndarray | None]]
 
-_SMALLEST_SIDE = 8  # ORB's pyramid fails below it, and no detector here finds anything in such an image
+_SMALLEST_SIDE = 8  # pixels; in smaller images ORB raises an error and the other detectors find nothing
 
 
 class _OpenCVExtractor(LocalExtractor):
-    """Orders what OpenCV finds, cuts it to `n_stored` rows and normalises it.
+    """Base of extractors that sort OpenCV's keypoints, keep `n_stored` of them and normalise their descriptors.
 
-    Rows are in falling order of response; equal responses (FAST's are integers) are ordered by y, x, size
-    and angle, so that the order does not depend on OpenCV's threads. Angles are 0..360, 0 where unknown.
+    Rows are in descending order of response; equal responses (FAST's are integers) are ordered by y, x, size
+    and angle, so that the order does not depend on OpenCV's threads. Angles are 0..360, 0 if unknown.
 
-    Binary descriptors become one column a bit, -1 or +1 before normalising: the squared Euclidean
+    Binary descriptors become one column per bit, -1 or +1 before normalising: the squared Euclidean
     distance of two rows is 4/D of their Hamming distance.
     """
 
@@ -39,16 +39,17 @@ class _OpenCVExtractor(LocalExtractor):
 
     @abstractmethod
     def _options(self) -> Settings:
-        """The settings of this kind of feature."""
+        """Settings of this kind of feature, besides those of all."""
 
     @abstractmethod
     def _describer(self) -> Describe:
-        """From an image to keypoints and (n, bytes) uint8 or (n, D) float32 descriptors (or None).
+        """Make a function from an image to keypoints and (n, bytes) uint8 or (n, D) float32 descriptors, or None.
 
-        Made anew for each call of `extract`, as OpenCV's objects are not safe to share between threads.
+        Called in each call of `extract`, because OpenCV's objects must not be shared between threads.
         """
 
     def _record(self, image: np.ndarray, describe: Describe) -> Record:
+        """Describe one image, sort its keypoints, and fill up with zero rows."""
         keypoints = np.zeros((self.n_stored, 5), np.float32)
         descriptors = np.zeros((self.n_stored, self.descriptor_dim), np.float32)
         found, raw = describe(image) if min(image.shape) >= _SMALLEST_SIDE else ((), None)
@@ -59,7 +60,7 @@ class _OpenCVExtractor(LocalExtractor):
             x, y, size, response, angle = rows.T
             order = np.lexsort((angle, size, x, y, -response))[:count]
             keypoints[:count] = rows[order]
-            descriptors[:count] = _normalised(raw[order])
+            descriptors[:count] = _normalise_rows(raw[order])
         return {
             "descriptors": descriptors,
             "keypoints": keypoints,
@@ -68,8 +69,8 @@ class _OpenCVExtractor(LocalExtractor):
         }
 
 
-def _normalised(raw: np.ndarray) -> np.ndarray:
-    """(n, D) float32 unit rows, out of float rows or of packed bits."""
+def _normalise_rows(raw: np.ndarray) -> np.ndarray:
+    """Unit rows (n, D) float32 from rows of floats or of packed bits."""
     rows = np.unpackbits(raw, axis=1) * np.float32(2) - 1 if raw.dtype == np.uint8 else raw
     norms = np.linalg.norm(rows, axis=1, keepdims=True)
     return rows / np.maximum(norms, np.finfo(np.float32).tiny)
@@ -101,8 +102,8 @@ class SIFT(_OpenCVExtractor):
 class ORB(_OpenCVExtractor):
     """Oriented FAST and rotated BRIEF (Rublee et al. 2011), 256 columns; the response is Harris's.
 
-    Each level of its pyramid has a quota of the `n_stored` features, so N above `MIN_STORED_FEATURES` may
-    change which features are the strongest.
+    Each level of its pyramid has a quota of the `n_stored` features, so with N above
+    `MIN_STORED_FEATURES` other features may be the strongest.
 
     Args:
         n_features: N, how many of the strongest features the networks read.
@@ -125,11 +126,11 @@ class ORB(_OpenCVExtractor):
 
 
 class _FastCorners(_OpenCVExtractor):
-    """Descriptors without a detector of their own, at FAST corners (Rosten and Drummond 2006).
+    """Base of descriptors without a detector of their own: they are computed at FAST corners (Rosten, Drummond 2006).
 
-    FAST, because it alone fills 300 rows of ordinary indoor frames for both: STAR finds a third of that,
-    and of ORB's large keypoints FREAK discards three quarters, as its pattern leaves the image. Corners too
-    near the border to be described are dropped before the strongest are taken.
+    Of OpenCV's detectors only FAST finds 300 keypoints in ordinary indoor frames for both: STAR finds a third of that,
+    and FREAK discards three quarters of ORB's large keypoints, because its pattern leaves the image. Corners too near
+    the border to be described are dropped before the strongest are taken.
 
     Args:
         n_features: N, how many of the strongest features the networks read.
@@ -150,7 +151,7 @@ class _FastCorners(_OpenCVExtractor):
 
     @abstractmethod
     def _descriptor(self) -> cv2.Feature2D:
-        """OpenCV's descriptor."""
+        """Make OpenCV's descriptor extractor."""
 
 
 class FREAK(_FastCorners):

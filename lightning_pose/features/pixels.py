@@ -1,4 +1,4 @@
-"""The images themselves, in one size: what networks read that are trained from end to end."""
+"""The images themselves, in one size: input of networks that are trained from end to end."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from lightning_pose.features.base import FeatureExtractor, Record
 
 __all__ = ["Pixels"]
 
-_TINY = 32  # side of the thumbnails that retrieval compares
+_TINY = 32  # side of the images that retrieval compares
 
 
 class Pixels(FeatureExtractor):
-    """RGB images, (3, height, width) uint8: resized until they cover that, and cut to its middle.
+    """RGB images, (3, height, width) uint8: resized until they cover that size, then cropped to their middle.
 
-    The default keeps the whole of an image of 4:3, the shorter side at the 256 pixels that ImageNet's networks
-    are tested with. A record holds `pixels`. Image retrieval compares gray thumbnails of 32 x 32 without their mean
+    The default keeps the whole of an image of 4:3, with the shorter side of 256 pixels that networks have in ImageNet's
+    tests. A record holds `pixels`. Image retrieval compares gray thumbnails of 32 x 32 without their mean
     (Torralba et al., PAMI 2008).
 
     Args:
-        height: of what the networks read, in pixels.
+        height: of the resized images, in pixels.
         width: likewise.
 
     Raises:
@@ -71,7 +71,7 @@ class Pixels(FeatureExtractor):
         return features.flip(-1)
 
     def _fit(self, image: np.ndarray) -> np.ndarray:
-        """(H, W, 3) -> (height, width, 3)."""
+        """Resize and crop an image (H, W, 3) to (height, width, 3)."""
         rows, columns = image.shape[:2]
         scale = max(self.height / rows, self.width / columns)
         size = max(self.width, round(columns * scale)), max(self.height, round(rows * scale))

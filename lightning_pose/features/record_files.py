@@ -1,4 +1,4 @@
-"""One record, one file: written whole or not at all, and read back only if it is what was written."""
+"""Files of one record each: never written in part, and read only if the content is what was written."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from safetensors.numpy import save
 from lightning_pose.errors import CacheError
 from lightning_pose.features.base import Record
 
-__all__ = ["TEMPORARY", "DamagedError", "read_record", "write_record", "write_whole"]
+__all__ = ["TEMPORARY", "DamagedError", "read_record", "write_file_atomically", "write_record"]
 
 TEMPORARY = ".tmp"
 """Suffix of a file that is being written."""
@@ -29,7 +29,7 @@ def read_record(file: Path) -> Record | None:
 
     Raises:
         DamagedError: the file is cut short or altered.
-        CacheError: the file may not be read.
+        CacheError: the file exists and cannot be read.
     """
     try:
         with safe_open(file, framework="numpy") as opened:
@@ -41,7 +41,7 @@ def read_record(file: Path) -> Record | None:
         raise CacheError(f"{file} cannot be read ({error}); check its permissions, or delete it") from error
     except (SafetensorError, ValueError, TypeError) as error:
         raise DamagedError(error) from error
-    if written != _checksum(record):
+    if written != _compute_checksum(record):
         raise DamagedError("its checksum differs")
     return record
 
@@ -50,15 +50,15 @@ def write_record(file: Path, record: Record) -> None:
     """Write a record as a safetensors file with its checksum in the metadata.
 
     Raises:
-        CacheError: as `write_whole`.
+        CacheError: as `write_file_atomically`.
     """
-    # safetensors writes the memory of an array as it lies, transposed if the array is.
+    # safetensors writes an array in its memory order, so a transposed array would be saved transposed.
     record = {name: np.asarray(array, order="C") for name, array in record.items()}
-    write_whole(file, save(record, {"checksum": _checksum(record)}))
+    write_file_atomically(file, save(record, {"checksum": _compute_checksum(record)}))
 
 
-def write_whole(file: Path, data: bytes) -> None:
-    """Write a file so that nobody ever sees a part of it; its folder is made.
+def write_file_atomically(file: Path, data: bytes) -> None:
+    """Write a file under a temporary name and rename it, so that no process reads a part of it; make its folder.
 
     Raises:
         CacheError: the folder cannot be written, or the disk is full.
@@ -77,7 +77,7 @@ def write_whole(file: Path, data: bytes) -> None:
         ) from error
 
 
-def _checksum(record: Record) -> str:
+def _compute_checksum(record: Record) -> str:
     """CRC-32 of every array's name, type, shape and bytes."""
     crc = 0
     for name in sorted(record):

@@ -1,4 +1,4 @@
-"""Image retrieval: one vector an image, and the nearest of them."""
+"""Image retrieval: one vector per image, and the nearest vectors."""
 
 from __future__ import annotations
 
@@ -9,23 +9,25 @@ from torch.nn import functional as F
 
 from lightning_pose.errors import ConfigError
 
-__all__ = ["global_vectors", "nearest"]
+__all__ = ["compute_global_vectors", "find_nearest"]
 
 VLAD_CENTRES = 64
 
 VLAD_SAMPLE = 50_000
+"""Descriptors that the centres are computed from."""
 
 CHUNK = 256
+"""Images whose distances or vectors are computed at once, to limit memory."""
 
 
-def global_vectors(
+def compute_global_vectors(
     train_features: Tensor | np.ndarray, test_features: Tensor | np.ndarray, seed: int = 0
 ) -> tuple[Tensor, Tensor]:
-    """One L2-normalised vector per image, in which near means alike; a blank image's is zero.
+    """Compute one L2-normalised vector per image; similar images have near vectors, an image without features zero.
 
     Args:
         train_features: (N, D) global vectors; (N, M, D) local descriptors, absent ones zero rows, which
-            become VLAD vectors over centres learned on these alone; or (N, C, H, W) maps, mean-pooled.
+            become VLAD vectors with centres from the training images alone; or (N, C, H, W) maps, mean-pooled.
         test_features: (N_test, ...), the same layout.
         seed: of the k-means.
 
@@ -43,22 +45,22 @@ def global_vectors(
             "give both as (N, D), (N, M, D) or (N, C, H, W)"
         )
     if train.dim() == 3:
-        centres = _vlad_centres(train, seed)
-        return _vlad(train, centres), _vlad(test, centres)
+        centres = _learn_vlad_centres(train, seed)
+        return _compute_vlad(train, centres), _compute_vlad(test, centres)
     if train.dim() == 4:
         train, test = train.mean((2, 3)), test.mean((2, 3))
     return F.normalize(train, dim=-1), F.normalize(test, dim=-1)
 
 
-def nearest(query: Tensor, reference: Tensor, k: int) -> Tensor:
-    """(N_query, min(k, N_reference)) indices of the nearest reference rows, nearest first, ties in order."""
+def find_nearest(query: Tensor, reference: Tensor, k: int) -> Tensor:
+    """Indices (N_query, min(k, N_reference)) of the nearest reference rows, by distance, then by row."""
     rows = [torch.cdist(chunk, reference).sort(dim=1, stable=True).indices[:, :k] for chunk in query.split(CHUNK)]
     return torch.cat(rows)
 
 
-def _vlad_centres(descriptors: Tensor, seed: int) -> Tensor:
-    """(K, D) k-means centres of a sample of (N, M, D) descriptors; K is smaller where these are few."""
-    from sklearn.cluster import MiniBatchKMeans  # seconds to import, and only local descriptors need it
+def _learn_vlad_centres(descriptors: Tensor, seed: int) -> Tensor:
+    """K-means centres (K, D) of a sample of descriptors (N, M, D); K is VLAD_CENTRES, or less if there are fewer."""
+    from sklearn.cluster import MiniBatchKMeans  # takes seconds to import, and only local descriptors need it
 
     rows = descriptors.flatten(0, 1)
     real = rows.any(dim=1).nonzero().squeeze(1)
@@ -70,10 +72,10 @@ def _vlad_centres(descriptors: Tensor, seed: int) -> Tensor:
     return torch.from_numpy(kmeans.fit(sample).cluster_centers_).float()
 
 
-def _vlad(descriptors: Tensor, centres: Tensor) -> Tensor:
-    """(N, K * D) VLAD vectors: per centre the sum of its descriptors' residuals (Jegou et al., CVPR 2010).
+def _compute_vlad(descriptors: Tensor, centres: Tensor) -> Tensor:
+    """VLAD vectors (N, K * D): for each centre the sum of its descriptors' residuals (Jegou et al., CVPR 2010).
 
-    Signed square roots tame bursts of one descriptor (Jegou et al., PAMI 2012); each centre's part is
+    Signed square roots reduce the weight of repeated descriptors (Jegou et al., PAMI 2012); each centre's part is
     L2-normalised (Arandjelovic & Zisserman, CVPR 2013), then the whole.
     """
     K, D = centres.shape

@@ -1,4 +1,4 @@
-"""The figures of systems that take clips: their trajectories, errors by clip length, cost by features, responses.
+"""The figures of systems that take clips: their trajectories, errors by clip length, responses.
 
 As in `figures.images`, each function returns a matplotlib `Figure` and touches neither pyplot, nor a display, nor the
 disk; the model is blue and the truth black.
@@ -19,30 +19,26 @@ from numpy.typing import ArrayLike
 
 from lightning_pose.figures.style import (
     BASELINES,
+    CLIP_BASELINES,
     MODEL,
     OTHERS,
     SMALLEST,
     STYLE,
     TRUTH,
     Errors,
+    find_longest_axes,
     log_axis,
-    longest_axes,
 )
 
-__all__ = ["error_by_length", "relative_trajectories", "responses"]
+__all__ = ["draw_error_by_length", "draw_relative_trajectories", "draw_responses"]
 
-CLIP_BASELINES = {
-    "no_motion": ("#8c8c8c", (0, (1, 1.5))),
-    "constant_velocity": ("#D55E00", (0, (5, 1.5))),
-    "visual_odometry": ("#009E73", (0, (5, 1.5, 1, 1.5))),
-}
 PANELS = 9  # three by three: more would be too small to read
 TITLE = 28  # letters above a panel that do not reach into the next one
 COLUMNS = 8  # filters in a row
 
 
 @matplotlib.rc_context(STYLE)
-def relative_trajectories(
+def draw_relative_trajectories(
     truth: Mapping[str, ArrayLike],
     prediction: Mapping[str, ArrayLike],
     title: str = "Trajectories relative to their first frame",
@@ -51,11 +47,11 @@ def relative_trajectories(
 ) -> Figure:
     """True and predicted positions, one panel a sequence (thesis, fig. 6.3); a black dot marks where each begins.
 
-    A panel shows the two axes along which its truth extends furthest. A prediction that strays from the truth's
-    bounds by more than their own size leaves the panel; where it is not finite it has a gap.
+    A panel shows the two axes along which its truth extends furthest. A prediction further outside the truth's
+    bounds than their own size is cut off; where it is not finite it has a gap.
 
     Args:
-        truth: sequence to (M, 3) positions in order; the first nine are drawn, and the title says of how many.
+        truth: sequence to (M, 3) positions in order; the first nine are drawn, and the title gives the total.
         prediction: sequence to (M, 3), in the same axes.
         title: the heading.
         unit: unit of the positions and of the errors.
@@ -66,23 +62,23 @@ def relative_trajectories(
     rows = max(1, math.ceil(len(names) / columns))
     size = {1: 5.5, 2: 4.0}.get(columns, 3.2)
     figure = Figure(figsize=(size * columns, (size - 0.05) * rows + 0.7), dpi=150, layout="constrained")
-    _heading(figure, title if len(names) == len(truth) else f"{title} ({len(names)} of {len(truth)})")
+    _add_heading(figure, title if len(names) == len(truth) else f"{title} ({len(names)} of {len(truth)})")
     panels = figure.subplots(rows, columns, squeeze=False).flat
     for axes, name in itertools.zip_longest(panels, names):
         if name is None:
             axes.remove()
             continue
-        _panel(axes, np.asarray(truth[name], float), np.asarray(prediction[name], float), unit)
+        _draw_panel(axes, np.asarray(truth[name], float), np.asarray(prediction[name], float), unit)
         error = math.nan if errors is None else errors.get(name, math.nan)
-        told = "" if math.isnan(error) else f"  {error:.3g} {unit}"
-        axes.set_title(_shortened(name, TITLE - len(told)) + told, fontsize=9, pad=6)
+        suffix = "" if math.isnan(error) else f"  {error:.3g} {unit}"
+        axes.set_title(_shorten_name(name, TITLE - len(suffix)) + suffix, fontsize=9, pad=6)
     if names:
         figure.legend(handles=figure.axes[0].get_lines(), loc="outside lower center", ncols=3)
     return figure
 
 
 @matplotlib.rc_context(STYLE)
-def error_by_length(
+def draw_error_by_length(
     lengths: ArrayLike, errors: Mapping[str, Errors], title: str = "Error by clip length", unit: str = "m"
 ) -> Figure:
     """Median position and orientation error against the length of a clip, one line a system (thesis, fig. 6.4).
@@ -95,9 +91,9 @@ def error_by_length(
         unit: unit of the position errors.
     """
     lengths = np.asarray(lengths, float)
-    looks = _looks(errors)
+    looks = _choose_looks(errors)
     figure = Figure(figsize=(10, 5.2), dpi=150, layout="constrained")
-    _heading(figure, title)
+    _add_heading(figure, title)
     panels = figure.subplots(1, 2)
     for column, label in enumerate((f"median position error ({unit})", "median orientation error (°)")):
         axes, drawn = panels[column], [np.empty(0)]
@@ -108,8 +104,8 @@ def error_by_length(
             width, size = (2.6, 6) if color == MODEL else (1.6, 4)
             axes.plot(lengths, y, "o", color=color, linestyle=dash, linewidth=width, markersize=size, label=name)
             drawn.append(y[np.isfinite(y)])
-        log_axis(axes, "y", _decade_or_more(np.concatenate(drawn)))
-        _log_axis_of(axes, lengths)
+        log_axis(axes, "y", _decade_limits(np.concatenate(drawn)))
+        _set_log_axis(axes, lengths)
         axes.set(xlabel="clip length (frames)", ylabel=label)
     if errors:
         figure.legend(handles=panels[0].get_lines(), loc="outside lower center", ncols=5, handlelength=3.5)
@@ -117,10 +113,10 @@ def error_by_length(
 
 
 @matplotlib.rc_context(STYLE)
-def responses(
+def draw_responses(
     images: Sequence[ArrayLike], layers: Mapping[str, Sequence[ArrayLike]], title: str = "What the filters respond to"
 ) -> Figure:
-    """A clip's frames, and below them what each layer makes of one, a row a layer (thesis, fig. 6.5).
+    """A clip's frames, and below them each layer's responses to one of them, one row per layer (thesis, fig. 6.5).
 
     Each response has its own scale of gray, so that weak ones show too. A map far from square is stretched.
 
@@ -133,10 +129,10 @@ def responses(
     if len(images):
         rows = {"input": [np.asarray(image) for image in images][:COLUMNS], **rows}
     columns = max([len(row) for row in rows.values()], default=1) or 1
-    ratios = [_height(row) for row in rows.values()] or [1.0]
+    ratios = [_row_height(row) for row in rows.values()] or [1.0]
     side = max(1.0, 5.5 / columns)
     figure = Figure(figsize=(side * columns + 1.6, side * sum(ratios) + 1.0), dpi=150, layout="constrained")
-    _heading(figure, title)
+    _add_heading(figure, title)
     panels = figure.subplots(len(ratios), columns, squeeze=False, gridspec_kw={"height_ratios": ratios})
     for axes in panels.flat:
         axes.set(xticks=[], yticks=[])
@@ -152,18 +148,19 @@ def responses(
     return figure
 
 
-def _heading(figure: Figure, title: str) -> None:
+def _add_heading(figure: Figure, title: str) -> None:
+    """Write the figure's title at its top left."""
     figure.suptitle(title, x=0.015, ha="left", fontsize=12, fontweight="bold")
 
 
-def _panel(axes: Axes, truth: np.ndarray, prediction: np.ndarray, unit: str) -> None:
-    """One sequence in a square."""
-    across, up = plane = longest_axes(truth)
+def _draw_panel(axes: Axes, truth: np.ndarray, prediction: np.ndarray, unit: str) -> None:
+    """Draw one sequence's trajectories within square limits."""
+    across, up = plane = find_longest_axes(truth)
     truth, prediction = truth[:, plane], prediction[:, plane]
     axes.plot(*truth.T, color=TRUTH, linewidth=1.8, solid_capstyle="round", label="truth")
     axes.plot(*prediction.T, color=MODEL, linewidth=1.6, solid_capstyle="round", label="prediction")
     axes.plot(*truth[0], "o", color=TRUTH, markersize=7, linestyle="none", label="start", zorder=3)
-    low, high = _square(truth, prediction)
+    low, high = _square_limits(truth, prediction)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
     axes.set(xlabel=f"{'xyz'[across]} ({unit})", ylabel=f"{'xyz'[up]} ({unit})")
     step = np.diff(MaxNLocator(5, steps=[1, 2, 5, 10]).tick_values(0, high[0] - low[0]))[0]
@@ -172,8 +169,11 @@ def _panel(axes: Axes, truth: np.ndarray, prediction: np.ndarray, unit: str) -> 
     axes.tick_params(labelsize=9)
 
 
-def _square(truth: np.ndarray, prediction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(2,) corners of a square around the truth, and the prediction as far as it keeps near; all, if no motion is."""
+def _square_limits(truth: np.ndarray, prediction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper corner (2,) of a square around the truth and the prediction, as far as that is near the truth.
+
+    Without motion in the truth, all of the prediction counts.
+    """
     low, high = truth.min(axis=0), truth.max(axis=0)
     reach = (high - low).max() or math.inf
     near = np.clip(prediction[np.isfinite(prediction).all(axis=1)], low - reach, high + reach)
@@ -183,13 +183,13 @@ def _square(truth: np.ndarray, prediction: np.ndarray) -> tuple[np.ndarray, np.n
     return (low + high) / 2 - half, (low + high) / 2 + half
 
 
-def _looks(systems: Iterable[str]) -> dict[str, tuple[str, str | tuple]]:
+def _choose_looks(systems: Iterable[str]) -> dict[str, tuple[str, str | tuple]]:
     """Colour and dash of each system: a baseline's own, blue for the first of the others."""
     own, others = BASELINES | CLIP_BASELINES, itertools.cycle([(MODEL, "-"), *OTHERS])
     return {name: own[name] if name in own else next(others) for name in dict.fromkeys(systems)}
 
 
-def _decade_or_more(values: np.ndarray) -> tuple[float, float]:
+def _decade_limits(values: np.ndarray) -> tuple[float, float]:
     """Limits of a logarithmic axis around positive values, wide enough for it to have ticks to read."""
     if not len(values):
         return 0.1, 1.0
@@ -197,9 +197,9 @@ def _decade_or_more(values: np.ndarray) -> tuple[float, float]:
     return min(low, high / 10), high
 
 
-def _log_axis_of(axes: Axes, values: np.ndarray) -> None:
+def _set_log_axis(axes: Axes, values: np.ndarray) -> None:
     """Make the x axis logarithmic, with a tick at each of a few positive values that is not too near the next."""
-    limits = _decade_or_more(values)
+    limits = _decade_limits(values)
     log_axis(axes, "x", limits)
     gap = (limits[1] / limits[0]) ** 0.09
     kept: list[float] = []
@@ -209,12 +209,13 @@ def _log_axis_of(axes: Axes, values: np.ndarray) -> None:
     axes.xaxis.set_major_locator(FixedLocator(kept))
 
 
-def _height(row: Sequence[np.ndarray]) -> float:
-    """Height of a row of cells of width 1: as its images have it, within reason."""
+def _row_height(row: Sequence[np.ndarray]) -> float:
+    """Height of a row of panels of width 1: the median of its images, limited to 0.4 to 1.4."""
     shapes = [image.shape for image in row]
     return float(np.clip(np.median([h / w for h, w, *_ in shapes]), 0.4, 1.4)) if shapes else 1.0
 
 
-def _shortened(name: str, length: int) -> str:
+def _shorten_name(name: str, length: int) -> str:
+    """A name of at most `length` letters, its middle left out if it is longer."""
     half = (length - 1) // 2
     return name if len(name) <= length else f"{name[:half]}…{name[-half:]}"

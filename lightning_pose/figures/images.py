@@ -1,4 +1,4 @@
-"""The figures of a run: where it went, how often it is how wrong, and what its errors depend on.
+"""The figures of a test of single images: trajectory, cumulative errors, and error against distance.
 
 Each function returns a matplotlib `Figure` and touches neither pyplot, nor a display, nor the disk. The
 model is blue and the truth black throughout; baselines keep their own colour (Okabe & Ito's palette, which
@@ -26,16 +26,16 @@ from lightning_pose.figures.style import (
     TRUTH,
     Errors,
     find_log_limits,
+    find_longest_axes,
     log_axis,
-    longest_axes,
     nan_to_infinity,
 )
 
-__all__ = ["cumulative_errors", "error_vs_distance", "trajectory"]
+__all__ = ["draw_cumulative_errors", "draw_error_vs_distance", "draw_trajectory"]
 
 
 @matplotlib.rc_context(STYLE)
-def trajectory(
+def draw_trajectory(
     truth_m: ArrayLike,
     prediction_m: ArrayLike,
     sequences: Sequence[str] | None = None,
@@ -45,8 +45,8 @@ def trajectory(
 ) -> Figure:
     """True and predicted positions in the plane of the two axes along which the truth extends furthest.
 
-    A segment joins each prediction to its truth; a ring marks where each sequence begins. The view keeps
-    to where the truth and nearly all predictions are; the legend says how many lie outside.
+    A segment joins each prediction to its truth; a ring marks where each sequence begins. The limits hold the
+    truth and nearly all predictions; the legend counts the predictions outside.
 
     Args:
         truth_m: (N, 3), the frames of a sequence together and in order.
@@ -58,10 +58,10 @@ def trajectory(
     """
     truth, prediction = np.asarray(truth_m, float), np.asarray(prediction_m, float)
     names = np.asarray(["" for _ in truth] if sequences is None else sequences)
-    plane = across, up = longest_axes(truth)
+    plane = across, up = find_longest_axes(truth)
     training = np.asarray(np.empty((0, 3)) if training_m is None else training_m, float)[:, plane]
     truth, prediction = truth[:, plane], prediction[:, plane]
-    low, high = _view(truth, prediction)
+    low, high = _find_limits(truth, prediction)
     outside = int((~((prediction >= low) & (prediction <= high)).all(axis=1)).sum())
 
     width, height = high - low
@@ -95,21 +95,21 @@ def trajectory(
 
 
 @matplotlib.rc_context(STYLE)
-def cumulative_errors(
+def draw_cumulative_errors(
     model: Errors,
     baselines: Mapping[str, Errors],
     name: str = "model",
     title: str = "Share of frames within an error",
     unit: str = "m",
 ) -> Figure:
-    """How many frames are within each position error, and within each orientation error; higher is better.
+    """The share of frames within each position error, and within each orientation error; higher is better.
 
     The legends show the medians, worst last. NaN counts as infinite, so a curve may end below 100 %.
 
     Args:
         model: the model's errors.
         baselines: errors of what it is compared with, by name.
-        name: what to call the model.
+        name: the model's name.
         title: the heading.
         unit: unit of the position errors.
     """
@@ -143,7 +143,7 @@ def cumulative_errors(
 
 
 @matplotlib.rc_context(STYLE)
-def error_vs_distance(
+def draw_error_vs_distance(
     position_error_m: ArrayLike,
     distance_m: ArrayLike,
     title: str = "Error against distance from the training poses",
@@ -180,7 +180,7 @@ def error_vs_distance(
     return figure
 
 
-def _view(truth: np.ndarray, prediction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _find_limits(truth: np.ndarray, prediction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(2,) lower and upper limits that hold all truth and the middle 96 % of predictions, with a margin."""
     drawn = prediction[np.isfinite(prediction).all(axis=1)]
     ends = np.quantile(drawn, [0.02, 0.98], axis=0) if len(drawn) else np.empty((0, 2))

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from numpy.typing import ArrayLike
 
+from lightning_pose.metrics import catalog
+
+if TYPE_CHECKING:
+    from matplotlib.typing import RcKeyType
+
 __all__ = [
     "BASELINES",
+    "CLIP_BASELINES",
     "MODEL",
     "OTHERS",
     "SMALLEST",
@@ -18,8 +25,9 @@ __all__ = [
     "TRAINING",
     "TRUTH",
     "Errors",
+    "find_log_limits",
+    "find_longest_axes",
     "log_axis",
-    "longest_axes",
 ]
 
 Errors = tuple[ArrayLike, ArrayLike]
@@ -27,18 +35,29 @@ Errors = tuple[ArrayLike, ArrayLike]
 
 MODEL, TRUTH, TRAINING = "#0072B2", "#1a1a1a", "#c4c4c4"
 
-BASELINES = {
-    "train_mean": ("#8c8c8c", (0, (1, 1.5))),
-    "retrieval_top1": ("#D55E00", (0, (5, 1.5))),
-    "retrieval_top5": ("#E69F00", (0, (3, 1.5))),
-    "oracle": ("#009E73", (0, (5, 1.5, 1, 1.5))),
-}
+Look = tuple[str, str | tuple]
+"""Colour and dashes of a line."""
 
-OTHERS = [("#CC79A7", (0, (5, 1.5))), ("#56B4E9", (0, (3, 1.5))), ("#882255", (0, (1, 1)))]
+GRAY_DOTS: Look = ("#8c8c8c", (0, (1, 1.5)))
+RED_DASHES: Look = ("#D55E00", (0, (5, 1.5)))
+ORANGE_DASHES: Look = ("#E69F00", (0, (3, 1.5)))
+GREEN_DASH_DOTS: Look = ("#009E73", (0, (5, 1.5, 1, 1.5)))
 
-SMALLEST = 1e-4  # a tenth of a millimetre, or its like in degrees: zero has no place on a logarithmic axis
 
-STYLE: dict[Any, Any] = {
+def assign_looks(clips: bool, looks: Sequence[Look]) -> dict[str, Look]:
+    """The catalogue's baselines of clips or of single images, in its order, each with a look while there are looks."""
+    names = [name for name, baseline in catalog.BASELINES.items() if baseline.clips == clips]
+    return dict(zip(names, looks, strict=False))
+
+
+BASELINES = assign_looks(False, (GRAY_DOTS, RED_DASHES, ORANGE_DASHES, GREEN_DASH_DOTS))
+CLIP_BASELINES = assign_looks(True, (GRAY_DOTS, RED_DASHES, GREEN_DASH_DOTS))
+
+OTHERS: list[Look] = [("#CC79A7", (0, (5, 1.5))), ("#56B4E9", (0, (3, 1.5))), ("#882255", (0, (1, 1)))]
+
+SMALLEST = 1e-4  # metres or degrees, drawn for zero, which a logarithmic axis cannot show
+
+STYLE: dict[RcKeyType, object] = {
     "font.family": "DejaVu Sans",
     "font.size": 10,
     "axes.titlesize": 12,
@@ -62,12 +81,13 @@ STYLE: dict[Any, Any] = {
 }
 
 
-def longest_axes(truth_m: np.ndarray) -> list[int]:
+def find_longest_axes(truth_m: np.ndarray) -> list[int]:
     """The two axes, in order, along which positions (N, 3) extend furthest."""
     return sorted(int(axis) for axis in np.argsort(-np.ptp(truth_m, axis=0), kind="stable")[:2])
 
 
 def nan_to_infinity(errors: ArrayLike) -> np.ndarray:
+    """Errors as an array in which infinity replaces NaN."""
     values = np.asarray(errors, float)
     return np.where(np.isnan(values), np.inf, values)
 

@@ -1,12 +1,13 @@
 """Quaternions, relative poses and pose errors: pure, batched, differentiable torch functions.
 
-Quaternions are Hamilton, `wxyz`, camera-to-world; q and -q are the same rotation. Leading dimensions are
-batch and broadcast. Positions are in metres (or the scene's unit).
+Quaternions are Hamilton, `wxyz`, camera-to-world; q and -q are the same rotation. Positions are in metres (or the
+scene's unit). Leading dimensions are batch dimensions: those written `*#batch` broadcast.
 """
 
 from __future__ import annotations
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 __all__ = [
@@ -25,14 +26,13 @@ __all__ = [
 ]
 
 
-def quat_normalize(quat_wxyz: Tensor) -> Tensor:
-    """Scale quaternions to unit length.
+def quat_normalize(quat_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
+    """Scale quaternions of any length to unit length.
 
-    Args:
-        quat_wxyz: (..., 4), any length.
+    A zero quaternion becomes the identity, with zero gradient; NaN stays NaN.
 
-    Returns:
-        (..., 4), unit. A zero quaternion becomes the identity, with zero gradient; NaN stays NaN.
+    >>> quat_normalize(torch.tensor([0.0, 3.0, 0.0, 4.0]))
+    tensor([0.0000, 0.6000, 0.0000, 0.8000])
     """
     identity = quat_wxyz.new_tensor([1.0, 0.0, 0.0, 0.0])
     is_zero = torch.linalg.vector_norm(quat_wxyz, dim=-1, keepdim=True) == 0
@@ -40,15 +40,14 @@ def quat_normalize(quat_wxyz: Tensor) -> Tensor:
     return quat_wxyz / torch.linalg.vector_norm(quat_wxyz, dim=-1, keepdim=True)
 
 
-def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
-    """Hamilton product: the rotation b followed by the rotation a, as in `R_a @ R_b`.
+def quat_multiply(a: Float[Tensor, "*#batch 4"], b: Float[Tensor, "*#batch 4"]) -> Float[Tensor, "*batch 4"]:
+    """Hamilton product of two quaternions: the rotation b followed by the rotation a, as in `R_a @ R_b`.
 
-    Args:
-        a: (..., 4) wxyz.
-        b: (..., 4) wxyz.
+    The product of unit quaternions has unit length.
 
-    Returns:
-        (..., 4) wxyz; unit where both are.
+    >>> i, j = torch.tensor([0.0, 1, 0, 0]), torch.tensor([0.0, 0, 1, 0])
+    >>> quat_multiply(i, j)  # k
+    tensor([0., 0., 0., 1.])
     """
     aw, ax, ay, az = a.unbind(-1)
     bw, bx, by, bz = b.unbind(-1)
@@ -63,20 +62,21 @@ def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
     )
 
 
-def quat_conjugate(quat_wxyz: Tensor) -> Tensor:
-    """(..., 4) with the vector part negated: the inverse rotation of a unit quaternion."""
+def quat_conjugate(quat_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
+    """Negate the vector part, which gives the inverse rotation of a unit quaternion.
+
+    >>> quat_conjugate(torch.tensor([0.5, 0.5, -0.5, 0.5]))
+    tensor([ 0.5000, -0.5000,  0.5000, -0.5000])
+    """
     return quat_wxyz * quat_wxyz.new_tensor([1.0, -1.0, -1.0, -1.0])
 
 
-def quat_rotate(quat_wxyz: Tensor, vector: Tensor) -> Tensor:
-    """Rotate vectors: `R(quat) @ vector`.
+def quat_rotate(quat_wxyz: Float[Tensor, "*#batch 4"], vector: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*batch 3"]:
+    """Rotate vectors by unit quaternions: `R(quat) @ vector`.
 
-    Args:
-        quat_wxyz: (..., 4), unit.
-        vector: (..., 3).
-
-    Returns:
-        (..., 3).
+    >>> half_turn_about_z = torch.tensor([0.0, 0, 0, 1])
+    >>> quat_rotate(half_turn_about_z, torch.tensor([1.0, 2, 3]))
+    tensor([-1., -2.,  3.])
     """
     w, u = quat_wxyz[..., :1], quat_wxyz[..., 1:]
     u, vector = torch.broadcast_tensors(u, vector)
@@ -84,8 +84,14 @@ def quat_rotate(quat_wxyz: Tensor, vector: Tensor) -> Tensor:
     return vector + w * t + torch.linalg.cross(u, t)
 
 
-def quat_to_matrix(quat_wxyz: Tensor) -> Tensor:
-    """Rotation matrices, (..., 3, 3), of unit quaternions, (..., 4)."""
+def quat_to_matrix(quat_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rotation matrices of unit quaternions.
+
+    >>> quat_to_matrix(torch.tensor([0.5, 0.5, 0.5, 0.5]))  # a third of a turn: x to y to z to x
+    tensor([[0., 0., 1.],
+            [1., 0., 0.],
+            [0., 1., 0.]])
+    """
     w, x, y, z = quat_wxyz.unbind(-1)
     rows = [
         torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], dim=-1),
@@ -95,14 +101,13 @@ def quat_to_matrix(quat_wxyz: Tensor) -> Tensor:
     return torch.stack(rows, dim=-2)
 
 
-def matrix_to_quat(matrix: Tensor) -> Tensor:
-    """Unit quaternions of rotation matrices, accurate at every angle, half turns included.
+def matrix_to_quat(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
+    """Unit quaternions, with w >= 0, of rotation matrices; accurate at every angle, half turns included.
 
-    Args:
-        matrix: (..., 3, 3), proper rotations (not checked).
+    That the matrices are rotations is not checked.
 
-    Returns:
-        (..., 4) wxyz, unit, with w >= 0.
+    >>> matrix_to_quat(torch.diag(torch.tensor([1.0, -1, -1])))  # half a turn about x
+    tensor([0., 1., 0., 0.])
     """
     (m00, m01, m02), (m10, m11, m12), (m20, m21, m22) = (row.unbind(-1) for row in matrix.unbind(-2))
     # Row i is 4 * q_i * q: every row points along q, and the one with the largest q_i has no cancellation.
@@ -118,48 +123,52 @@ def matrix_to_quat(matrix: Tensor) -> Tensor:
     return align_hemisphere(quat_normalize(row), row.new_tensor([1.0, 0.0, 0.0, 0.0]))
 
 
-def align_hemisphere(quat_wxyz: Tensor, reference: Tensor) -> Tensor:
-    """Choose, of q and -q, the one on the reference's side.
+def align_hemisphere(
+    quat_wxyz: Float[Tensor, "*#batch 4"], reference: Float[Tensor, "*#batch 4"]
+) -> Float[Tensor, "*batch 4"]:
+    """Of q and -q, which are one rotation, the quaternion with `<q, reference> >= 0`.
 
-    Args:
-        quat_wxyz: (..., 4).
-        reference: (..., 4).
+    A product of exactly zero leaves q as it is.
 
-    Returns:
-        (..., 4), the same rotations, with <q, reference> >= 0; a product of exactly zero leaves q as it is.
+    >>> align_hemisphere(torch.tensor([-1.0, 0, 0, 0]), torch.tensor([1.0, 0, 0, 0]))
+    tensor([1., -0., -0., -0.])
     """
     opposite = (quat_wxyz * reference).sum(-1, keepdim=True) < 0
     return torch.where(opposite, -quat_wxyz, quat_wxyz)
 
 
-def mean_quat(quat_wxyz: Tensor, weights: Tensor | None = None) -> Tensor:
-    """Mean rotation: the principal eigenvector of sum(w q q^T), blind to signs (Markley et al., JGCD 2007).
+def mean_quat(
+    quat_wxyz: Float[Tensor, "*batch n 4"], weights: Float[Tensor, "*batch n"] | None = None
+) -> Float[Tensor, "*batch 4"]:
+    """Mean rotation: the principal eigenvector of sum(w q q^T) (Markley et al., JGCD 2007).
+
+    The signs of the quaternions make no difference to the rotation.
 
     Args:
-        quat_wxyz: (..., N, 4), unit, N >= 1.
-        weights: (..., N), non-negative, not all zero; equal weights when None.
+        quat_wxyz: unit; n at least 1.
+        weights: non-negative, not all zero; equal weights when None.
 
     Returns:
-        (..., 4), unit, on the side of the first quaternion. Where the mean is not unique (two rotations
-        half a turn apart), one of the candidates.
+        unit quaternions, in the hemisphere of the first of the n. Where the mean is not unique (two rotations half
+        a turn apart), one of the candidates.
+
+    >>> rotations = torch.tensor([[1.0, 0, 0, 0], [0.6, 0.8, 0, 0], [0.6, -0.8, 0, 0]])
+    >>> mean_quat(rotations).round(decimals=3).abs()
+    tensor([1., 0., 0., 0.])
     """
     weighted = quat_wxyz if weights is None else quat_wxyz * weights.unsqueeze(-1)
     principal = torch.linalg.eigh(weighted.mT @ quat_wxyz).eigenvectors[..., -1]
     return align_hemisphere(principal, quat_wxyz[..., 0, :])
 
 
-def orientation_error_deg(a: Tensor, b: Tensor) -> Tensor:
-    """Angle of the rotation between two orientations, `2 * acos(|<a, b>|)`, in degrees.
+def orientation_error_deg(a: Float[Tensor, "*#batch 4"], b: Float[Tensor, "*#batch 4"]) -> Float[Tensor, "*batch"]:
+    """Angle of the rotation between two orientations, `2 * acos(|<a, b>|)`, in degrees, 0 to 180.
 
-    Computed as `4 * atan2(|a - b|, |a + b|)`: acos loses all digits near zero (in float32 0.03 degrees
-    become 0), this keeps them.
+    Computed as `4 * atan2(|a - b|, |a + b|)`, which is accurate near zero, where acos in float32 gives 0 for 0.03
+    degrees. Quaternions of any length are accepted; NaN gives NaN.
 
-    Args:
-        a: (..., 4) wxyz; any length, normalised here.
-        b: (..., 4) wxyz; any length, normalised here.
-
-    Returns:
-        (...), 0 to 180; NaN where an input is.
+    >>> orientation_error_deg(torch.tensor([1.0, 0, 0, 0]), torch.tensor([-1.0, 0, 0, 1]))  # a quarter turn
+    tensor(90.)
     """
     a, b = quat_normalize(a), quat_normalize(b)
     difference = torch.linalg.vector_norm(a - b, dim=-1)
@@ -168,37 +177,46 @@ def orientation_error_deg(a: Tensor, b: Tensor) -> Tensor:
     return torch.rad2deg(2 * half_angle)
 
 
-def position_error_m(a: Tensor, b: Tensor) -> Tensor:
-    """Euclidean distance, (...), between positions, (..., 3) and (..., 3), in their unit."""
+def position_error_m(a: Float[Tensor, "*#batch 3"], b: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*batch"]:
+    """Euclidean distance between positions, in their unit.
+
+    >>> position_error_m(torch.tensor([3.0, 0, 1]), torch.tensor([0.0, 4, 1]))
+    tensor(5.)
+    """
     return torch.linalg.vector_norm(a - b, dim=-1)
 
 
-def relative_pose(position_a: Tensor, quat_a: Tensor, position_b: Tensor, quat_b: Tensor) -> tuple[Tensor, Tensor]:
-    """Pose of b seen from a: `T_a^-1 T_b`, the translation in the axes of a.
+def relative_pose(
+    position_a: Float[Tensor, "*#batch 3"],
+    quat_a: Float[Tensor, "*#batch 4"],
+    position_b: Float[Tensor, "*#batch 3"],
+    quat_b: Float[Tensor, "*#batch 4"],
+) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch 4"]]:
+    """Pose of b relative to a, `T_a^-1 T_b`, its position in the axes of a; the inverse of `compose_pose`.
 
-    Args:
-        position_a: (..., 3).
-        quat_a: (..., 4) wxyz, unit.
-        position_b: (..., 3).
-        quat_b: (..., 4) wxyz, unit.
+    All quaternions are unit.
 
-    Returns:
-        position (..., 3) and quat_wxyz (..., 4) of b in a; the inverse of `compose_pose`.
+    >>> half_turn_about_z = torch.tensor([0.0, 0, 0, 1])
+    >>> a, b = torch.tensor([1.0, 0, 0]), torch.tensor([3.0, 0, 5])
+    >>> relative_pose(a, half_turn_about_z, b, half_turn_about_z)
+    (tensor([-2.,  0.,  5.]), tensor([1., 0., 0., 0.]))
     """
     inverse = quat_conjugate(quat_a)
     return quat_rotate(inverse, position_b - position_a), quat_multiply(inverse, quat_b)
 
 
-def compose_pose(position_a: Tensor, quat_a: Tensor, position_ab: Tensor, quat_ab: Tensor) -> tuple[Tensor, Tensor]:
-    """Pose of b in the world, `T_a T_ab`, from the pose of a and the pose of b seen from a.
+def compose_pose(
+    position_a: Float[Tensor, "*#batch 3"],
+    quat_a: Float[Tensor, "*#batch 4"],
+    position_ab: Float[Tensor, "*#batch 3"],
+    quat_ab: Float[Tensor, "*#batch 4"],
+) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch 4"]]:
+    """Pose of b in the world, `T_a T_ab`, from the pose of a in the world and the pose of b relative to a.
 
-    Args:
-        position_a: (..., 3).
-        quat_a: (..., 4) wxyz, unit.
-        position_ab: (..., 3).
-        quat_ab: (..., 4) wxyz, unit.
+    All quaternions are unit.
 
-    Returns:
-        position (..., 3) and quat_wxyz (..., 4).
+    >>> half_turn_about_z, identity = torch.tensor([0.0, 0, 0, 1]), torch.tensor([1.0, 0, 0, 0])
+    >>> compose_pose(torch.tensor([1.0, 0, 0]), half_turn_about_z, torch.tensor([-2.0, 0, 5]), identity)
+    (tensor([3., 0., 5.]), tensor([0., 0., 0., 1.]))
     """
     return position_a + quat_rotate(quat_a, position_ab), quat_multiply(quat_a, quat_ab)

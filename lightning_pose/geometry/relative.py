@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Literal, get_args
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from lightning_pose.errors import ConfigError
@@ -13,31 +14,40 @@ from lightning_pose.geometry.quaternions import compose_pose, quat_conjugate, qu
 __all__ = ["Chain", "RelativeFrame", "absolute_poses", "chain_steps", "check_relative_frame", "relative_poses"]
 
 RelativeFrame = Literal["camera", "world"]
-"""The axes of a relative position: those of the clip's first camera, or the world's as eq. 6.1 has it."""
+"""The axes of a relative position: those of the clip's first camera, or those of the world, as in eq. 6.1."""
 
 
 def check_relative_frame(name: str) -> None:
-    """Refuse any other name.
+    """Raise an error unless the name is a `RelativeFrame`.
 
     Raises:
         ConfigError: it is neither `camera` nor `world`.
+
+    >>> check_relative_frame("camera")
     """
     if name not in get_args(RelativeFrame):
         raise ConfigError(f"relative_frame is {name!r}; give one of {', '.join(get_args(RelativeFrame))}")
 
 
-def relative_poses(position_m: Tensor, quat_wxyz: Tensor, frame: RelativeFrame = "camera") -> tuple[Tensor, Tensor]:
-    """Every pose of a clip relative to its first: eq. 6.1, whose world axes a network cannot know in a new scene.
+def relative_poses(
+    position_m: Float[Tensor, "*batch t 3"], quat_wxyz: Float[Tensor, "*batch t 4"], frame: RelativeFrame = "camera"
+) -> tuple[Float[Tensor, "*batch t 3"], Float[Tensor, "*batch t 4"]]:
+    """Poses of a clip's t frames relative to the pose of its first frame (thesis, eq. 6.1).
 
     Args:
-        position_m: (..., T, 3) camera centres in the world.
-        quat_wxyz: (..., T, 4), unit, camera-to-world.
-        frame: `world` keeps `x_n - x_0` in world axes, as eq. 6.1 does; `camera` turns it into those of the first
-            camera.
+        position_m: camera centres in the world.
+        quat_wxyz: unit, camera-to-world.
+        frame: `world` gives `x_n - x_0` in world axes, as eq. 6.1 does. `camera` rotates it into the axes of the
+            first camera, because images of a new scene do not show where the world's axes point.
 
     Returns:
-        position_m (..., T, 3) and quat_wxyz (..., T, 4), `q_0^-1 q_n` with w >= 0; zero and the identity for the
-        first frame.
+        relative positions, and `q_0^-1 q_n` with w >= 0; zero and the identity for the first frame.
+
+    >>> half_turn_about_z = torch.tensor([[0.0, 0, 0, 1]]).expand(2, 4)
+    >>> position_m, quat_wxyz = relative_poses(torch.tensor([[1.0, 0, 0], [3.0, 0, 0]]), half_turn_about_z)
+    >>> position_m
+    tensor([[ 0.,  0.,  0.],
+            [-2.,  0.,  0.]])
     """
     first_position, inverse = position_m[..., :1, :], quat_conjugate(quat_wxyz[..., :1, :])
     moved = position_m - first_position
@@ -47,39 +57,48 @@ def relative_poses(position_m: Tensor, quat_wxyz: Tensor, frame: RelativeFrame =
 
 
 def absolute_poses(
-    position_m: Tensor,
-    quat_wxyz: Tensor,
-    first_position_m: Tensor,
-    first_quat_wxyz: Tensor,
+    position_m: Float[Tensor, "*batch t 3"],
+    quat_wxyz: Float[Tensor, "*batch t 4"],
+    first_position_m: Float[Tensor, "*batch 3"],
+    first_quat_wxyz: Float[Tensor, "*batch 4"],
     frame: RelativeFrame = "camera",
-) -> tuple[Tensor, Tensor]:
-    """The inverse of `relative_poses`, from the first frame's pose in the world.
+) -> tuple[Float[Tensor, "*batch t 3"], Float[Tensor, "*batch t 4"]]:
+    """Poses in the world from relative poses and the first frame's pose; the inverse of `relative_poses`.
 
     Args:
-        position_m: (..., T, 3) relative.
-        quat_wxyz: (..., T, 4) relative, unit.
-        first_position_m: (..., 3) in the world.
-        first_quat_wxyz: (..., 4) in the world, unit.
+        position_m: relative.
+        quat_wxyz: relative, unit.
+        first_position_m: in the world.
+        first_quat_wxyz: in the world, unit.
         frame: as for `relative_poses`.
 
-    Returns:
-        position_m (..., T, 3) and quat_wxyz (..., T, 4) in the world.
+    >>> identity = torch.tensor([1.0, 0, 0, 0])
+    >>> absolute_poses(torch.tensor([[2.0, 0, 0]]), identity[None], torch.tensor([0.0, 1, 0]), identity)[0]
+    tensor([[2., 1., 0.]])
     """
     first_position, first_quat = first_position_m.unsqueeze(-2), first_quat_wxyz.unsqueeze(-2)
     moved = quat_rotate(first_quat, position_m) if frame == "camera" else position_m
     return first_position + moved, quat_multiply(first_quat, quat_wxyz)
 
 
-def chain_steps(position_m: Tensor, quat_wxyz: Tensor) -> tuple[Tensor, Tensor]:
-    """Compose steps, each the pose of a camera seen from the one before it.
+def chain_steps(
+    position_m: Float[Tensor, "batch steps 3"], quat_wxyz: Float[Tensor, "batch steps 4"]
+) -> tuple[Float[Tensor, "batch steps+1 3"], Float[Tensor, "batch steps+1 4"]]:
+    """Compose steps, each the pose of a camera relative to the camera before it.
 
     Args:
-        position_m: (B, T - 1, 3), each in the axes of the camera before.
-        quat_wxyz: (B, T - 1, 4), unit.
+        position_m: each in the axes of the camera before.
+        quat_wxyz: unit.
 
     Returns:
-        position_m (B, T, 3) in the axes of the first camera and quat_wxyz (B, T, 4) with w >= 0, both relative to
-        the first camera, which comes first.
+        positions in the axes of the first camera, and quaternions with w >= 0, both relative to the first camera. The
+        first of the steps + 1 poses is that camera's own: zero and the identity.
+
+    >>> one_metre_ahead = torch.tensor([0.0, 0, 1]).expand(1, 2, 3)
+    >>> chain_steps(one_metre_ahead, torch.tensor([1.0, 0, 0, 0]).expand(1, 2, 4))[0]
+    tensor([[[0., 0., 0.],
+             [0., 0., 1.],
+             [0., 0., 2.]]])
     """
     position = position_m.new_zeros(len(position_m), 3)
     quat = quat_wxyz.new_tensor([1.0, 0.0, 0.0, 0.0]).expand(len(quat_wxyz), 4)
@@ -93,19 +112,30 @@ def chain_steps(position_m: Tensor, quat_wxyz: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class Chain:
-    """A trajectory of any length from overlapping clips, as they come: causal, so that it serves a live camera.
+    """Builds a trajectory of any length from overlapping clips, one clip at a time, as a live camera gives them.
 
-    Each clip must begin at a frame whose pose is known by then; its other frames are placed relative to that one. A
-    frame keeps the first pose it was given, so that nothing already answered changes.
+    Each clip must begin at a frame that an earlier clip contained; its other frames are placed relative to that one. A
+    frame keeps the first pose that it gets, so that poses already returned do not change.
 
     Args:
         frame: in which axes the clips' positions are, as for `relative_poses`.
-        position_m: (3,) of the first frame of all; the origin if not given.
-        quat_wxyz: (4,) of the first frame of all; the identity if not given.
+        position_m: of the first frame of all; the origin if not given.
+        quat_wxyz: of the first frame of all; the identity if not given.
+
+    >>> chain, identity = Chain(), torch.tensor([1.0, 0, 0, 0]).expand(2, 4)
+    >>> chain.add([0, 1], torch.tensor([[0.0, 0, 0], [0, 0, 1]]), identity)
+    [0, 1]
+    >>> chain.add([1, 2], torch.tensor([[0.0, 0, 0], [0, 0, 5]]), identity)
+    [2]
+    >>> chain.trajectory()[1][:, 2].tolist()
+    [0.0, 1.0, 6.0]
     """
 
     def __init__(
-        self, frame: RelativeFrame = "camera", position_m: Tensor | None = None, quat_wxyz: Tensor | None = None
+        self,
+        frame: RelativeFrame = "camera",
+        position_m: Float[Tensor, " 3"] | None = None,
+        quat_wxyz: Float[Tensor, " 4"] | None = None,
     ) -> None:
         check_relative_frame(frame)
         self.frame: RelativeFrame = frame
@@ -114,21 +144,21 @@ class Chain:
             torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64) if quat_wxyz is None else quat_wxyz.double().cpu(),
         )
         self.poses: dict[int, tuple[Tensor, Tensor]] = {}
-        """Frame number to position_m (3,) and quat_wxyz (4,), float64, in the order they became known."""
+        """Frame number to position_m (3,) and quat_wxyz (4,), float64, in the order in which they were added."""
 
-    def add(self, numbers: list[int], position_m: Tensor, quat_wxyz: Tensor) -> list[int]:
-        """Take in one clip.
+    def add(self, numbers: list[int], position_m: Float[Tensor, "t 3"], quat_wxyz: Float[Tensor, "t 4"]) -> list[int]:
+        """Add one clip of t frames.
 
         Args:
-            numbers: T frame numbers.
-            position_m: (T, 3) relative to the clip's first frame.
-            quat_wxyz: (T, 4) relative to the clip's first frame.
+            numbers: t frame numbers.
+            position_m: relative to the clip's first frame.
+            quat_wxyz: relative to the clip's first frame.
 
         Returns:
-            the numbers whose poses are new.
+            the numbers of the frames that had no pose before.
 
         Raises:
-            ConfigError: the clip begins at a frame that no earlier clip reached.
+            ConfigError: the clip begins at a frame that no earlier clip contained.
         """
         if not self.poses:
             self.poses[numbers[0]] = self._start
@@ -148,8 +178,8 @@ class Chain:
                 new.append(number)
         return new
 
-    def trajectory(self) -> tuple[list[int], Tensor, Tensor]:
-        """Frame numbers ascending, and their positions (M, 3) and quaternions (M, 4), float64."""
+    def trajectory(self) -> tuple[list[int], Float[Tensor, "m 3"], Float[Tensor, "m 4"]]:
+        """Frame numbers in ascending order, and their positions and quaternions, float64."""
         numbers = sorted(self.poses)
         positions, quats = zip(*(self.poses[number] for number in numbers), strict=True)
         return numbers, torch.stack(positions), torch.stack(quats)

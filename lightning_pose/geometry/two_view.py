@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import torch
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from lightning_pose.geometry.quaternions import matrix_to_quat
@@ -12,28 +13,41 @@ from lightning_pose.geometry.quaternions import matrix_to_quat
 __all__ = ["INLIER_PX", "MIN_INLIERS", "two_view_motion"]
 
 INLIER_PX = 1.0
+"""A match agrees with a motion if it lies at most this many pixels from its epipolar line."""
 
 MIN_INLIERS = 12
-"""With fewer, the motion is a guess. Of frames of an office half a second apart, 20 degrees turned, 8 or 9 inliers gave
-a better rotation than none at all for 41 %, 10 or 11 for 82 %, 12 to 14 for 85 %, 15 to 19 for 96 %."""
+"""Fewer matches that agree are not enough. Of frames of an office that were half a second and 20 degrees apart, 8 or 9
+inliers gave a better rotation than the identity for 41 %, 10 or 11 for 82 %, 12 to 14 for 85 %, 15 to 19 for 96 %."""
 
 
-def two_view_motion(points_a: np.ndarray, points_b: np.ndarray, focal_px: float) -> tuple[Tensor, Tensor] | None:
-    """Where camera b is, seen from camera a, up to scale: essential matrix of the matches, by RANSAC.
+def two_view_motion(
+    points_a: Float64[np.ndarray, "n 2"], points_b: Float64[np.ndarray, "n 2"], focal_px: float
+) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 4"]] | None:
+    """Pose of camera b relative to camera a, up to scale, from the essential matrix of the matches (RANSAC).
 
-    OpenCV's USAC_ACCURATE: on two videos its rotations were 12 to 37 % nearer the truth (median) than those of its
-    plain RANSAC. An essential matrix has two rotations, half a turn apart: the smaller one is taken. `recoverPose`
-    asks instead which has more points in front of both cameras, and does not count those farther than 50 steps, which
-    in a slow video are all of them: a tenth of a kitchen's steps, 8 mm each, came out half a turn wrong.
+    The estimator is OpenCV's USAC_ACCURATE: on two videos its rotations were 12 to 37 % closer to the truth (median)
+    than those of OpenCV's plain RANSAC. An essential matrix has two rotations, half a turn apart; the smaller one is
+    taken. `cv2.recoverPose` instead takes the one with more points in front of both cameras, without those farther away
+    than 50 times the step, which in a slow video are all of them: with it, a tenth of a kitchen's steps, 8 mm each,
+    were half a turn wrong.
 
     Args:
-        points_a: (N, 2) float64, matched points in normalised image coordinates, (pixel - centre) / focal length.
-        points_b: (N, 2), row by row the same points in the other view.
+        points_a: matched points in normalised image coordinates, (pixel - centre) / focal length.
+        points_b: the same points in the other view, row by row.
         focal_px: pixels to one normalised unit, for the threshold `INLIER_PX`.
 
     Returns:
-        position (3,), unit length, in the axes of a, and quat_wxyz (4,); `T_a^-1 T_b` but for the scale. None if
-        there are fewer than `MIN_INLIERS` matches, or as few agree on a motion, or nothing moved at all.
+        position, unit length, in the axes of a, and quat_wxyz; `T_a^-1 T_b` except for the scale. None if fewer than
+        `MIN_INLIERS` matches are given or agree on a motion, or if nothing moved.
+
+    >>> x, y = np.meshgrid(np.linspace(-1, 1, 6), np.linspace(-1, 1, 5))
+    >>> depth_m = 4 + np.arange(30.0) % 7
+    >>> points_m = np.column_stack([2 * x.ravel(), 2 * y.ravel(), depth_m])
+    >>> seen_by_b_m = points_m - [0.5, 0, 0]  # b is half a metre to the right of a
+    >>> points_a, points_b = (p[:, :2] / p[:, 2:] for p in (points_m, seen_by_b_m))
+    >>> position, quat_wxyz = two_view_motion(points_a, points_b, focal_px=500)
+    >>> position.round(decimals=3).abs(), quat_wxyz.round(decimals=3).abs()
+    (tensor([1., 0., 0.], dtype=torch.float64), tensor([1., 0., 0., 0.], dtype=torch.float64))
     """
     if len(points_a) < MIN_INLIERS:
         return None
@@ -47,12 +61,12 @@ def two_view_motion(points_a: np.ndarray, points_b: np.ndarray, focal_px: float)
     first, second, t = cv2.decomposeEssentialMat(essential)
     R = max((first, second), key=np.trace)
     inlier = mask.ravel() > 0
-    t = t.ravel() * _side(points_a[inlier], points_b[inlier], R, t.ravel())
+    t = t.ravel() * _find_sign(points_a[inlier], points_b[inlier], R, t.ravel())
     return torch.from_numpy(-R.T @ t), matrix_to_quat(torch.from_numpy(R.T.copy()))
 
 
-def _side(points_a: np.ndarray, points_b: np.ndarray, R: np.ndarray, t: np.ndarray) -> int:
-    """1 or -1: the sign of t with which more points lie in front of camera a.
+def _find_sign(points_a: np.ndarray, points_b: np.ndarray, R: np.ndarray, t: np.ndarray) -> int:
+    """Sign of t, 1 or -1, with which more points lie in front of camera a.
 
     From `z_b x_b = z_a R x_a + t`, `z_a (R x_a) x x_b = x_b x t`.
     """

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
-from lightning_pose.checkpoint import build, read_checkpoint
+from lightning_pose.checkpoint import build_object, read_checkpoint
 from lightning_pose.errors import CheckpointError
 from lightning_pose.features.base import FeatureExtractor
 from lightning_pose.geometry.relative import RelativeFrame
 from lightning_pose.localization.sequences import locate_sequence
 
 if TYPE_CHECKING:
-    from lightning_pose.models import ClipModule, PoseModule
+    from lightning_pose.models import PoseModule
 
 __all__ = ["Localizer"]
 
@@ -27,7 +27,7 @@ class Localizer:
     Args:
         extractor: makes the features.
         model: makes the poses.
-        clips: for a model of clips, how many frames one has and in which axes it answers.
+        clips: for a model of clips, frames of a clip and axes of its relative positions, as in training.
     """
 
     def __init__(
@@ -48,11 +48,11 @@ class Localizer:
         specs = checkpoint["lightning_pose"]
         if specs["data"] is None:
             raise CheckpointError(f"{path} does not say which features it reads; train with a data module")
-        model: PoseModule = build(specs["model"])
+        model: PoseModule = build_object(specs["model"])
         model.load_state_dict(checkpoint["state_dict"])
         data = specs["data"]["init_args"]
-        clips = (data["clip_length"], data["relative_frame"]) if "clip_length" in data else None
-        return cls(build(data["extractor"]), model, clips)
+        clips = (data["clip_length"], data["relative_frame"]) if model.reads_clips else None
+        return cls(build_object(data["extractor"]), model, clips)
 
     def __call__(self, images: Sequence[str | Path | np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Locate images.
@@ -61,8 +61,8 @@ class Localizer:
             images: M files, or uint8 arrays as `extractor.color` asks for: (H, W) gray or (H, W, 3) RGB.
 
         Returns:
-            position_m (M, 3) and quat_wxyz (M, 4), camera-to-world. A model of clips takes the images for a video, in
-            order, and the first camera for the world.
+            position_m (M, 3) and quat_wxyz (M, 4), camera-to-world. For a model of clips the images are one video, in
+            order, and the world is the first camera.
 
         Raises:
             ImageError: an image cannot be read.
@@ -72,7 +72,7 @@ class Localizer:
         records = self.extractor.extract(arrays)
         features = torch.from_numpy(np.stack([self.extractor.features(record) for record in records]))
         if self.clips is not None:
-            chained = locate_sequence(cast("ClipModule", self.model), features, *self.clips)
+            chained = locate_sequence(self.model, features, *self.clips)
             return chained[0].numpy(), chained[1].numpy()
         with torch.inference_mode():
             pose = self.model(features)

@@ -1,6 +1,6 @@
 """The localizer as an MLflow model: a table of image files in, a table of poses out.
 
-MLflow runs this file when it loads the model, which is safer than a pickle: the last line names the model.
+MLflow runs this file when it loads the model, which is safer than a pickle. The last line registers the model.
 """
 
 from __future__ import annotations
@@ -20,18 +20,20 @@ COLUMNS = ["x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"]
 
 
 class LocalizerModel(PythonModel):
-    """What `mlflow.pyfunc.load_model` gives back for a run's `model`."""
+    """The model that `mlflow.pyfunc.load_model` loads from a run's `model`."""
 
     def load_context(self, context: PythonModelContext) -> None:
         self.localizer = Localizer.from_checkpoint(context.artifacts["checkpoint"])
 
-    def predict(self, context: Any, model_input: list[str], params: dict[str, Any] | None = None) -> pd.DataFrame:
+    def predict(
+        self, context: PythonModelContext | None, model_input: list[str], params: dict[str, Any] | None = None
+    ) -> pd.DataFrame:
         """Locate images.
 
         Args:
-            context: MLflow's.
+            context: not used; MLflow passes it.
             model_input: image files; MLflow makes this list of a table with one column, too.
-            params: none are used.
+            params: not used.
 
         Returns:
             One row an image: camera centre in metres and camera-to-world quaternion.

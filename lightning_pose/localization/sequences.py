@@ -1,4 +1,4 @@
-"""Whole sequences from a model of clips: windows that share a frame, chained from the first frame on."""
+"""Trajectories of whole sequences from a model of clips: windows that share a frame, chained from the first frame."""
 
 from __future__ import annotations
 
@@ -11,31 +11,31 @@ from lightning_pose.geometry.relative import Chain, RelativeFrame
 
 if TYPE_CHECKING:
     from lightning_pose.data import ClipDataModule
-    from lightning_pose.models.clip import ClipModule
+    from lightning_pose.models.base import PoseModule
 
-__all__ = ["Chained", "chain_test", "locate_sequence", "windows"]
+__all__ = ["Chained", "chain_test_split", "cut_windows", "locate_sequence"]
 
 
-def windows(frames: int, length: int) -> list[range]:
+def cut_windows(frames: int, length: int) -> list[range]:
     """Clips of up to `length` frames that cover a sequence of `frames`, each beginning where the last one ended."""
     return [range(start, min(start + length, frames)) for start in range(0, max(1, frames - 1), length - 1)]
 
 
 def locate_sequence(
-    model: ClipModule,
+    model: PoseModule,
     features: Tensor,
     clip_length: int,
     relative_frame: RelativeFrame = "camera",
     first_position_m: Tensor | None = None,
     first_quat_wxyz: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """The trajectory of a sequence of any length.
+    """Compute the trajectory of a sequence of any length.
 
     Args:
-        model: in evaluation mode.
+        model: of clips, in evaluation mode.
         features: (M, *input_shape) of the sequence's frames, in order.
-        clip_length: frames of a clip, 2 or more, as the model was trained.
-        relative_frame: the axes it was trained with.
+        clip_length: frames of a clip, 2 or more, as in training.
+        relative_frame: axes of its positions, as in training.
         first_position_m: (3,) where the first frame is; the origin if not given.
         first_quat_wxyz: (4,) likewise; the identity if not given.
 
@@ -43,7 +43,7 @@ def locate_sequence(
         position_m (M, 3) and quat_wxyz (M, 4), float64.
     """
     chain = Chain(relative_frame, first_position_m, first_quat_wxyz)
-    for window in windows(len(features), clip_length):
+    for window in cut_windows(len(features), clip_length):
         with torch.inference_mode():
             pose = model(features[window.start : window.stop].unsqueeze(0).to(model.device))
         chain.add(list(window), pose.position_m[0], pose.quat_wxyz[0])
@@ -52,7 +52,7 @@ def locate_sequence(
 
 
 class Chained(NamedTuple):
-    """A run of test frames, M of them, and where a model says they are.
+    """A run of M test frames and their poses as a model locates them.
 
     Attributes:
         rows: (M,) rows of the test split's data.
@@ -65,8 +65,8 @@ class Chained(NamedTuple):
     quat_wxyz: Tensor
 
 
-def chain_test(model: ClipModule, datamodule: ClipDataModule) -> list[Chained]:
-    """Trajectories of the test split's runs of two frames or more, each from the true pose of its first frame."""
+def chain_test_split(model: PoseModule, datamodule: ClipDataModule) -> list[Chained]:
+    """Locate the test split's runs of two frames or more, each from the true pose of its first frame."""
     data, model = datamodule.dataset("test").data, model.eval()
     found = []
     for rows in (torch.from_numpy(run[:: datamodule.stride]) for run in datamodule.dataset("test").runs):

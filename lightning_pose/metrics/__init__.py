@@ -1,1 +1,1 @@
-"""Pose errors: `summary` of a set, `pose_metrics` over batches, `trajectory` errors of whole sequences."""
+"""Pose errors: `catalog` has all names, `summary` one set, `pose_metrics` batches, `trajectory` whole sequences."""

@@ -1,4 +1,4 @@
-"""The metrics of a split, gathered batch by batch and over processes."""
+"""Pose errors of a split, collected batch by batch and over processes, and their summary."""
 
 from __future__ import annotations
 
@@ -7,15 +7,16 @@ from torch import Tensor
 from torchmetrics import Metric
 
 from lightning_pose.geometry.quaternions import orientation_error_deg, position_error_m
-from lightning_pose.metrics.summary import RECALL_THRESHOLDS, summarize_errors
+from lightning_pose.metrics.summary import summarize_errors
 
-__all__ = ["RECALL_THRESHOLDS", "PoseMetrics", "summarize_errors"]
+__all__ = ["PoseMetrics"]
 
 
 class PoseMetrics(Metric):
-    """Median, mean and 95th percentile errors and recalls over all frames seen (see `summarize_errors`).
+    """Median, mean and 95th percentile errors and recalls over all frames added (see `summarize_errors`).
 
-    Keeps every frame's errors, because medians do not add up; under DDP they are gathered before `compute`.
+    Keeps every frame's errors, because a median cannot be computed from those of batches. With several processes (DDP)
+    the errors of all are gathered before `compute`.
     """
 
     is_differentiable = False
@@ -39,8 +40,8 @@ class PoseMetrics(Metric):
             position: (..., 3) true, metres.
             quat: (..., 4) true wxyz.
         """
-        position_error = position_error_m(_full(position_hat), _full(position))
-        orientation_error = orientation_error_deg(_full(quat_hat), _full(quat))
+        position_error = position_error_m(_promote_to_float32(position_hat), _promote_to_float32(position))
+        orientation_error = orientation_error_deg(_promote_to_float32(quat_hat), _promote_to_float32(quat))
         self.position_error_m.append(position_error.detach().flatten())
         self.orientation_error_deg.append(orientation_error.detach().flatten())
 
@@ -50,14 +51,14 @@ class PoseMetrics(Metric):
         Raises:
             ConfigError: no frame was added.
         """
-        return summarize_errors(_cat(self.position_error_m), _cat(self.orientation_error_deg))
+        return summarize_errors(_join_state(self.position_error_m), _join_state(self.orientation_error_deg))
 
 
-def _full(x: Tensor) -> Tensor:
-    """At least single precision: the half precision that autocast leaves rounds metres to centimetres."""
+def _promote_to_float32(x: Tensor) -> Tensor:
+    """At least single precision: the half precision of autocast would round metres to centimetres."""
     return x.to(torch.promote_types(x.dtype, torch.float32))
 
 
-def _cat(state: list[Tensor] | Tensor) -> Tensor:
-    """One vector of a state, which is a list before the processes' parts are gathered and a tensor after."""
+def _join_state(state: list[Tensor] | Tensor) -> Tensor:
+    """One vector from a state, which is a list before the processes' parts are gathered and a tensor afterwards."""
     return state if isinstance(state, Tensor) else torch.cat([torch.empty(0), *(s.cpu() for s in state)])

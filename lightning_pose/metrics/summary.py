@@ -11,19 +11,9 @@ import numpy as np
 import torch
 
 from lightning_pose.errors import ConfigError
+from lightning_pose.metrics.catalog import ERRORS
 
-__all__ = ["RECALL_THRESHOLDS", "summarize_errors"]
-
-RECALL_THRESHOLDS = {
-    "recall_1cm_1deg": (0.01, 1.0),
-    "recall_2cm_2deg": (0.02, 2.0),
-    "recall_5cm_5deg": (0.05, 5.0),
-    "recall_10cm_5deg": (0.10, 5.0),
-    "recall_25cm_2deg": (0.25, 2.0),
-    "recall_50cm_5deg": (0.50, 5.0),
-    "recall_5m_10deg": (5.0, 10.0),
-}
-"""Metric name to (metres, degrees): the share of frames within both, bounds included."""
+__all__ = ["summarize_errors"]
 
 
 def summarize_errors(
@@ -39,13 +29,12 @@ def summarize_errors(
         orientation_error_deg: as many, degrees.
 
     Returns:
-        `position_median_m`, `position_mean_m`, `position_p95_m`, `orientation_median_deg`,
-        `orientation_mean_deg`, `orientation_p95_deg` and the names of `RECALL_THRESHOLDS`.
+        The metrics of `catalog.ERRORS`: medians, means, 95th percentiles, and the recalls that it has.
 
     Raises:
         ConfigError: there are no errors, or not as many of one as of the other.
     """
-    position, orientation = _flat(position_error_m), _flat(orientation_error_deg)
+    position, orientation = _flatten_errors(position_error_m), _flatten_errors(orientation_error_deg)
     if not len(position) or len(position) != len(orientation):
         raise ConfigError(
             f"{len(position)} position errors and {len(orientation)} orientation errors have no summary; "
@@ -53,21 +42,23 @@ def summarize_errors(
         )
     summary = {}
     for name, unit, errors in (("position", "m", position), ("orientation", "deg", orientation)):
-        summary[f"{name}_median_{unit}"] = _quantile(errors, 0.5)
+        summary[f"{name}_median_{unit}"] = _interpolate_quantile(errors, 0.5)
         summary[f"{name}_mean_{unit}"] = float(errors.mean())
-        summary[f"{name}_p95_{unit}"] = _quantile(errors, 0.95)
-    for name, (metres, degrees) in RECALL_THRESHOLDS.items():
-        summary[name] = float(np.mean((position <= metres) & (orientation <= degrees)))
+        summary[f"{name}_p95_{unit}"] = _interpolate_quantile(errors, 0.95)
+    for name, metric in ERRORS.items():
+        if metric.within is not None:
+            metres, degrees = metric.within
+            summary[name] = float(np.mean((position <= metres) & (orientation <= degrees)))
     return summary
 
 
-def _flat(errors: torch.Tensor | np.ndarray) -> np.ndarray:
+def _flatten_errors(errors: torch.Tensor | np.ndarray) -> np.ndarray:
     values = torch.as_tensor(errors).detach().cpu().double().flatten().numpy()
     return np.where(np.isnan(values), np.inf, values)
 
 
-def _quantile(errors: np.ndarray, q: float) -> float:
-    """Linear interpolation that keeps infinities, of which np.quantile makes NaN."""
+def _interpolate_quantile(errors: np.ndarray, q: float) -> float:
+    """The q-quantile by linear interpolation that keeps infinities, of which np.quantile makes NaN."""
     ordered = np.sort(errors)
     place = q * (len(ordered) - 1)
     below, above = ordered[math.floor(place)], ordered[math.ceil(place)]

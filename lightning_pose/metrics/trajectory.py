@@ -1,4 +1,4 @@
-"""Errors of a whole trajectory: absolute and relative pose error, and drift by length, as KITTI has it."""
+"""Errors of a whole trajectory: absolute and relative pose error, and drift by length as in the KITTI benchmark."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ METRICS: tuple[str, ...] = ("ate_rmse_m", "ate_origin_rmse_m", "rpe_rmse_m", "rp
 
 
 class Drift(NamedTuple):
-    """Errors at the end of sub-trajectories relative to their own start, each an array (L,), a value a length.
+    """Errors at the end of sub-trajectories relative to their own start: arrays (L,), one value for each length.
 
-    NaN stands where no sub-trajectory is that long, and in `percent` also where none of them moved.
+    NaN if no sub-trajectory is that long, and in `percent` also if none of them moved.
     """
 
     lengths: np.ndarray
@@ -41,23 +41,23 @@ class Drift(NamedTuple):
     orientation_deg: np.ndarray
     """Median error of the end's orientation."""
     percent: np.ndarray
-    """Median of position error by the distance truly travelled, over those that moved, times 100."""
+    """Median of 100 times position error divided by the true distance travelled, of those that moved."""
     starts: np.ndarray
-    """How many sub-trajectories the medians are of: one a start."""
+    """How many sub-trajectories the medians are of: one for each start."""
 
 
 def trajectory_errors(position_hat: Array, quat_hat: Array, position: Array, quat: Array) -> dict[str, float]:
     """Absolute and relative errors of one sequence's trajectory (Sturm et al., IROS 2012), defined as in `evo`.
 
-    - `ate_rmse_m`: position error once the whole trajectory is laid on the truth by the best rotation and
-      translation, without scale (Umeyama, PAMI 1991): `evo_ape -a`. It measures the shape alone. Where the best
-      rotation is not unique (the camera keeps to a line, or stands still), the error is: that of any of them.
-    - `ate_origin_rmse_m`: position error once the first poses coincide: `evo_ape --align_origin`. How far it drifts.
+    - `ate_rmse_m`: position error after the whole trajectory is aligned to the truth by the best rotation and
+      translation, without scale (Umeyama, PAMI 1991): `evo_ape -a`. It measures the shape alone. If the best rotation
+      is not unique (the camera moves on a line, or not at all), the error is the same for all of them.
+    - `ate_origin_rmse_m`: position error after the first poses are aligned, `evo_ape --align_origin`: the drift.
     - `rpe_rmse_m`, `rpe_rmse_deg`: error of each step, from a row to the next: `evo_rpe --delta 1`.
 
-    A metric is NaN where the sequence is too short for it: `ate_rmse_m` of fewer than three poses, which can be laid on
-    almost anything, and all four of fewer than two. A prediction with a pose that is not finite has infinite errors, so
-    that losing track never looks better than drifting.
+    A metric is NaN if the sequence is too short for it: `ate_rmse_m` of fewer than three poses, which can be aligned
+    with almost anything, and all four of fewer than two. A prediction with a pose that is not finite has infinite
+    errors, so that it never counts as better than one that drifts.
 
     Args:
         position_hat: (M, 3) predicted camera centres, metres, in any world: they are aligned here.
@@ -69,23 +69,23 @@ def trajectory_errors(position_hat: Array, quat_hat: Array, position: Array, qua
         ConfigError: shapes do not fit.
         DataError: a true pose is not finite.
     """
-    hat, truth = _checked(position_hat, quat_hat, position, quat)
+    hat, truth = _check_poses(position_hat, quat_hat, position, quat)
     n_poses = len(truth[0])
     if n_poses < 2:
         return dict.fromkeys(METRICS, math.nan)
     finite = all(bool(part.isfinite().all()) for part in hat)
-    errors = _measured(hat, truth) if finite else dict.fromkeys(METRICS, math.inf)
+    errors = _measure_errors(hat, truth) if finite else dict.fromkeys(METRICS, math.inf)
     return errors if n_poses > 2 else errors | {"ate_rmse_m": math.nan}
 
 
 def mean_over_sequences(per_sequence: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
-    """Mean of each metric, every sequence counting once, whatever its length.
+    """Mean of each metric over sequences, each of the same weight, whatever its length.
 
-    A sequence whose metric is NaN (too short a sequence) is left out of that metric's mean, which is NaN where none has
-    it. An infinite error stays, and makes the mean infinite.
+    A sequence whose metric is NaN (it is too short) is left out of that metric's mean; the mean is NaN if all are left
+    out. An infinite error makes the mean infinite.
 
     Args:
-        per_sequence: sequence to metrics, as `trajectory_errors` gives them.
+        per_sequence: sequence to metrics, as `trajectory_errors` returns them.
     """
     names = dict.fromkeys(name for metrics in per_sequence.values() for name in metrics)
     means = {}
@@ -98,7 +98,9 @@ def mean_over_sequences(per_sequence: Mapping[str, Mapping[str, float]]) -> dict
 def drift_by_length(
     position_hat: Array, quat_hat: Array, position: Array, quat: Array, lengths: Sequence[int]
 ) -> Drift:
-    """How far off a sub-trajectory ends, by its length, from every start (Geiger et al., CVPR 2012, but in frames).
+    """Errors at the end of sub-trajectories of given lengths, from every start.
+
+    This is the drift of Geiger et al. (CVPR 2012), with lengths in frames instead of metres.
 
     Args:
         position_hat: (M, 3) predicted camera centres of one sequence, metres, in any world.
@@ -108,21 +110,22 @@ def drift_by_length(
         lengths: L numbers of steps, 1 or more: a clip of T images has T - 1.
 
     Returns:
-        a `Drift`; a prediction that is not finite counts as infinitely far off.
+        a `Drift`; a predicted pose that is not finite has infinite errors.
 
     Raises:
-        ConfigError: shapes do not fit, or a length below 1.
+        ConfigError: shapes do not fit, or a length is below 1.
         DataError: a true pose is not finite.
     """
     if min(lengths, default=1) < 1:
         raise ConfigError(f"lengths has {min(lengths)}, but a sub-trajectory has one step at least; give 1 or more")
-    hat, truth = _checked(position_hat, quat_hat, position, quat)
-    rows = [_drift(hat, truth, int(length)) for length in lengths]
+    hat, truth = _check_poses(position_hat, quat_hat, position, quat)
+    rows = [_measure_drift(hat, truth, int(length)) for length in lengths]
     metres, degrees, percent, starts = np.array(rows, float).reshape(len(rows), 4).T
     return Drift(np.array(lengths, int), metres, degrees, percent, starts.astype(int))
 
 
-def _checked(position_hat: Array, quat_hat: Array, position: Array, quat: Array) -> tuple[Poses, Poses]:
+def _check_poses(position_hat: Array, quat_hat: Array, position: Array, quat: Array) -> tuple[Poses, Poses]:
+    """Predicted and true poses in float64 on the CPU, with unit quaternions; raise the errors of the callers."""
     parts = [torch.as_tensor(part).detach().cpu().double() for part in (position_hat, quat_hat, position, quat)]
     shapes = [tuple(part.shape) for part in parts]
     n_poses = shapes[2][0] if shapes[2] else 0
@@ -134,29 +137,30 @@ def _checked(position_hat: Array, quat_hat: Array, position: Array, quat: Array)
     return (parts[0], quat_normalize(parts[1])), (parts[2], quat_normalize(parts[3]))
 
 
-def _measured(hat: Poses, truth: Poses) -> dict[str, float]:
+def _measure_errors(hat: Poses, truth: Poses) -> dict[str, float]:
     """The four metrics of two finite trajectories of at least two poses."""
     aligned = _align_positions(hat[0].numpy(), truth[0].numpy())
     start = compose_pose(truth[0][0], truth[1][0], *relative_pose(hat[0][0], hat[1][0], hat[0], hat[1]))[0]
     step_hat, step = (relative_pose(p[:-1], q[:-1], p[1:], q[1:]) for p, q in (hat, truth))
     return {
-        "ate_rmse_m": _root_mean_square(np.linalg.norm(aligned - truth[0].numpy(), axis=1)),
-        "ate_origin_rmse_m": _root_mean_square(position_error_m(start, truth[0]).numpy()),
-        "rpe_rmse_m": _root_mean_square(relative_pose(*step, *step_hat)[0].norm(dim=1).numpy()),
-        "rpe_rmse_deg": _root_mean_square(orientation_error_deg(step_hat[1], step[1]).numpy()),
+        "ate_rmse_m": _compute_rms(np.linalg.norm(aligned - truth[0].numpy(), axis=1)),
+        "ate_origin_rmse_m": _compute_rms(position_error_m(start, truth[0]).numpy()),
+        "rpe_rmse_m": _compute_rms(relative_pose(*step, *step_hat)[0].norm(dim=1).numpy()),
+        "rpe_rmse_deg": _compute_rms(orientation_error_deg(step_hat[1], step[1]).numpy()),
     }
 
 
-def _root_mean_square(errors: np.ndarray) -> float:
+def _compute_rms(errors: np.ndarray) -> float:
+    """Root mean square of errors."""
     return math.sqrt(np.mean(errors**2))
 
 
 def _align_positions(points: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    """Points (M, 3) moved by the rotation and translation nearest to the targets (Umeyama, PAMI 1991, without scale).
+    """Points (M, 3) moved by the rotation and translation closest to the targets (Umeyama, PAMI 1991, without scale).
 
-    Where the best rotation is not unique (on a straight line, or where either stands still), one of the best serves:
-    the sum of squares is the same for all. To align by the translation alone would not do: the error of a straight
-    walk would leap with the last digit of its straightness.
+    If the best rotation is not unique (on a straight line, or if points or targets are all equal), one of the best is
+    used: the sum of squares is the same for all. Aligning such a case by the translation alone would make the error of
+    a nearly straight walk depend on the last digit of its coordinates.
     """
     centre, target = points.mean(axis=0), targets.mean(axis=0)
     left, _, right = np.linalg.svd((targets - target).T @ (points - centre))
@@ -164,7 +168,7 @@ def _align_positions(points: np.ndarray, targets: np.ndarray) -> np.ndarray:
     return (points - centre) @ (left @ right).T + target
 
 
-def _drift(hat: Poses, truth: Poses, length: int) -> tuple[float, float, float, int]:
+def _measure_drift(hat: Poses, truth: Poses, length: int) -> tuple[float, float, float, int]:
     """Medians in metres, degrees and percent over all starts, and how many starts there are."""
     count = len(truth[0]) - length
     if count < 1:

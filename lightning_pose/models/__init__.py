@@ -1,4 +1,4 @@
-"""The architectures, one file each; `base` says how to add another."""
+"""The architectures, one file each; the docstring of `PoseModule` explains how to add another."""
 
 from lightning_pose.models.base import Pose, PoseModule
 from lightning_pose.models.clip import ClipModule

@@ -1,27 +1,28 @@
-"""PoseModule: what every architecture shares, from the training step to the pose it answers with."""
+"""PoseModule: what every architecture shares, from the training step to the pose that it returns."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import torch
 from lightning import LightningModule
+from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
 
 from lightning_pose.checkpoint import Spec, class_path, resolve_class_path
-from lightning_pose.data.batches import PoseBatch
+from lightning_pose.data.batches import PoseBatch, PoseDataset
+from lightning_pose.data.datamodule import SceneDataModule, find_datamodule, scene_datamodule
 from lightning_pose.errors import CheckpointError, ConfigError
 from lightning_pose.geometry.quaternions import align_hemisphere, mean_quat, quat_normalize
 from lightning_pose.losses import LossConfig, PoseLoss
 from lightning_pose.metrics.pose_metrics import PoseMetrics
+from lightning_pose.models.parts.scaling import measure_columns, measure_poses
+from lightning_pose.models.parts.schedule import cosine_factor
 
 __all__ = ["Pose", "PoseModule"]
 
 Stage = Literal["train", "val", "test"]
-
-_MOST_ELEMENTS = 2**25  # of the features that the scale is learnt from, where frames are large
 
 
 class Pose(NamedTuple):
@@ -34,17 +35,30 @@ class Pose(NamedTuple):
 class PoseModule(LightningModule):
     """Base class of the architectures.
 
-    To add one, subclass it in a file of its own, call `super().__init__(**kwargs)` first, and set
+    To add one, subclass it in a file of its own, call `super().__init__(**kwargs)` first, and set `input_ranks` and
+    `network`. Then export it in `models/__init__.py` and give it a config. Constructor arguments are plain types:
+    they are the checkpoint's hyperparameters, and rebuild the module anywhere.
 
-    - `self.network`: features (B, *input_shape) -> (B, 7), three numbers for the position and four for the
-      quaternion: with `standardize` in standard deviations around the mean training pose, otherwise in metres
-      and quaternion components. The loss always compares metres and quaternion components;
-    - `input_ranks`: how many axes `input_shape` may have;
-    - `feature_axis`: which axis holds the columns to standardize, if not the last;
-    - `memory`: names of what is as long as the training split; a checkpoint's length is taken over.
+    What a subclass sets or overrides:
 
-    Then export it in `models/__init__.py` and give it a config. Constructor arguments are plain types: they are
-    the checkpoint's hyperparameters, and rebuild the module anywhere.
+    | name | needed | what it is |
+    |---|---|---|
+    | `input_ranks` | always | how many axes `input_shape` may have |
+    | `network` | always | a module whose `forward` returns (B, 7): three for the position, four for the quaternion |
+    | `headline` | often | the settings that distinguish its runs, for run names and tables |
+    | `feature_axis` | seldom | the axis of `input_shape` that holds the columns to standardize, if not the last |
+    | `setup` | seldom | what is learnt from the training split before the first step; call `super().setup` first |
+    | `decode_features` | seldom | features to poses, where that takes more than one call of `network` |
+    | `decode_batch` | seldom | the same for a batch, where training differs from use |
+    | `training_splits` | seldom | the splits whose poses end up in the weights |
+    | `memory` | seldom | with `TrainingMemory`: what the checkpoint carries of every training frame |
+    | `reads_clips`, `check_data`, `training_poses`, `select_judged` | for clips | see `ClipModule` |
+
+    With `standardize`, the seven numbers are in standard deviations around the mean training pose; otherwise they are
+    metres and quaternion components. The loss always compares metres and quaternion components.
+
+    `ClosedFormModule` is the base class for networks that are solved instead of trained in steps; `models/parts/` has
+    what else several architectures share.
 
     Args:
         input_shape: shape of one frame's features; on the command line it follows from the data.
@@ -61,9 +75,8 @@ class PoseModule(LightningModule):
     """
 
     input_ranks: ClassVar[tuple[int, ...]]
-    feature_axis: ClassVar[int] = -1
-    memory: ClassVar[tuple[str, ...]] = ()
     reads_clips: ClassVar[bool] = False
+    """Whether features are those of clips, (B, T, *input_shape), as data modules with `gives_clips` have them."""
     network: nn.Module
     pose_mean: Tensor
     pose_scale: Tensor
@@ -113,72 +126,81 @@ class PoseModule(LightningModule):
         self.register_buffer("feature_scale", torch.ones(columns))
 
     @property
+    def feature_axis(self) -> int:
+        """The axis of `input_shape` with the columns to standardize, counted from the last."""
+        return -1
+
+    @property
     def headline(self) -> str:
         """The settings that distinguish runs of this architecture, for run names and tables."""
         return "x".join(map(str, self.input_shape))
 
     @property
-    def learns_from(self) -> tuple[str, ...]:
-        """The splits whose poses end up in the weights; image retrieval may search the same."""
+    def training_splits(self) -> tuple[str, ...]:
+        """The splits whose poses end up in the weights; the image retrieval baseline searches the same."""
         return ("train",)
 
     def forward(self, features: Tensor) -> Pose:
         """Features (B, *input_shape) -> poses of B frames."""
-        position_m, quat_raw = self._decode(features)
+        position_m, quat_raw = self.decode_features(features)
         return Pose(position_m, quat_normalize(quat_raw))
 
-    def _decode(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Positions in metres and quaternions not yet normalised, as the losses of the thesis compare them."""
-        return self._unscaled(self.network(self._standardized(features)))
+    def decode_features(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Compute poses, as the losses of the thesis compare them.
 
-    def _decode_batch(self, batch: PoseBatch) -> tuple[Tensor, Tensor]:
-        """As `_decode`, for an architecture that must know which frames it is trained on."""
-        return self._decode(batch.features)
+        Args:
+            features: (B, *input_shape).
 
-    def _standardized(self, features: Tensor) -> Tensor:
+        Returns:
+            Positions (B, 3) in metres and quaternions (B, 4) not yet normalised.
+        """
+        return self.unscale_pose(self.network(self.standardize_input(features)))
+
+    def decode_batch(self, batch: PoseBatch) -> tuple[Tensor, Tensor]:
+        """As `decode_features`, in the steps of training, validation and test.
+
+        For an architecture that augments features in training, or uses which frames they are of.
+        """
+        return self.decode_features(batch.features)
+
+    def standardize_input(self, features: Tensor) -> Tensor:
+        """Features in standard deviations around their mean; as they are without `standardize_features`."""
         if not self.standardize_features:
             return features
         return (features - self.feature_mean) / self.feature_scale
 
-    def _unscaled(self, pose: Tensor) -> tuple[Tensor, Tensor]:
+    def unscale_pose(self, pose: Tensor) -> tuple[Tensor, Tensor]:
+        """The network's (..., 7) numbers as positions (..., 3) in metres and quaternions (..., 4)."""
         pose = pose * self.pose_scale + self.pose_mean
         return pose[..., :3], pose[..., 3:]
 
     def fit_scale(self, position_m: Tensor, quat_wxyz: Tensor) -> None:
-        """Learn the hemisphere of the targets, and with `standardize` their mean and spread, from training poses.
+        """Learn the hemisphere of the targets, and with `standardize` their mean and spread.
 
-        One spread serves the three axes of the position and one the four components of the quaternion, so that
-        distances keep their shape.
+        Args:
+            position_m: (M, 3) of training.
+            quat_wxyz: (M, 4) of training.
         """
         self.quat_reference.copy_(mean_quat(quat_wxyz))
         if self.standardize:
-            poses = torch.cat([position_m, align_hemisphere(quat_wxyz, self.quat_reference)], dim=-1)
-            self.pose_mean.copy_(poses.mean(0))
-            for part in (slice(0, 3), slice(3, 7)):
-                variance = (poses[:, part] - self.pose_mean[part]).square().mean()
-                self.pose_scale[part] = variance.sqrt().clamp(min=1e-6)
+            mean, spread = measure_poses(position_m, quat_wxyz, self.quat_reference)
+            self.pose_mean.copy_(mean)
+            self.pose_scale.copy_(spread)
 
     def fit_feature_scale(self, features: Tensor) -> None:
-        """Learn each column's mean and spread from (B, *input_shape) training features.
+        """With `standardize_features`, learn each column's mean and spread from (M, *input_shape) training features."""
+        found = measure_columns(features, self.feature_axis) if self.standardize_features else None
+        if found is not None:
+            self.feature_mean.copy_(found[0].view_as(self.feature_mean))
+            self.feature_scale.copy_(found[1].view_as(self.feature_scale))
 
-        Rows of zeros, where a frame had fewer features, do not count. A thousand frames are enough.
-        """
-        if not self.standardize_features:
-            return
-        frames = min(1000, max(1, _MOST_ELEMENTS // max(1, features[0].numel())))
-        rows = features[:: -(-len(features) // frames)].movedim(self.feature_axis, -1).flatten(0, -2)
-        rows = rows[rows.any(1)].float()
-        if len(rows) > 1:
-            self.feature_mean.copy_(rows.mean(0).view_as(self.feature_mean))
-            self.feature_scale.copy_(rows.std(0).clamp(min=1e-6).view_as(self.feature_scale))
-
-    def check_data(self, datamodule: Any) -> None:
+    def check_data(self, datamodule: SceneDataModule) -> None:
         """Refuse data that this architecture cannot read; the command line asks before it opens a run.
 
         Raises:
             ConfigError: it gives clips where images are read, or the other way round.
         """
-        if self.reads_clips != getattr(datamodule, "gives_clips", False):
+        if self.reads_clips != datamodule.gives_clips:
             wanted, given = ("clips", "images") if self.reads_clips else ("images", "clips")
             raise ConfigError(
                 f"{type(self).__name__} reads {wanted}, but {type(datamodule).__name__} gives {given}; set "
@@ -186,19 +208,26 @@ class PoseModule(LightningModule):
             )
 
     def setup(self, stage: str) -> None:
-        self.check_data(self.trainer.datamodule)  # type: ignore[attr-defined]
-        if stage == "fit":
-            train = self.trainer.datamodule.dataset("train")  # type: ignore[attr-defined]
-            self.fit_scale(*(part.to(self.device) for part in self._training_poses(train)))
+        """Check the data, and in `fit` learn the scales of poses and features from the training split.
+
+        Raises:
+            ConfigError: as `check_data`; in `fit`, the trainer has no data module.
+        """
+        datamodule = scene_datamodule(self.trainer) if stage == "fit" else find_datamodule(self.trainer)
+        if datamodule is not None:
+            self.check_data(datamodule)
+        if datamodule is not None and stage == "fit":
+            train = datamodule.dataset("train")
+            self.fit_scale(*(part.to(self.device) for part in self.training_poses(train)))
             self.fit_feature_scale(train.data.features)
 
-    def _training_poses(self, train: Any) -> tuple[Tensor, Tensor]:
-        """Positions (M, 3) and quaternions (M, 4) that the network is to answer with in training."""
-        return train.data.position_m, train.data.quat_wxyz
+    def training_poses(self, train: PoseDataset) -> tuple[Tensor, Tensor]:
+        """Positions (M, 3) and quaternions (M, 4) that the network is to return in training; they set its scale."""
+        return train.targets()
 
     def _step(self, batch: PoseBatch, stage: Stage) -> tuple[Tensor, Pose]:
-        """The one step behind training, validation and test: decode, compare, log."""
-        position_m, quat_raw = self._decode_batch(batch)
+        """Decode a batch, compare it with the truth, and log; the same in training, validation and test."""
+        position_m, quat_raw = self.decode_batch(batch)
         target = align_hemisphere(batch.quat_wxyz, self.quat_reference)
         terms = self.loss(position_m, quat_raw, batch.position_m, target)
         names = {f"{stage}/loss" if name == "total" else f"{stage}/loss_{name}": t for name, t in terms.items()}
@@ -206,11 +235,11 @@ class PoseModule(LightningModule):
         pose = Pose(position_m, quat_normalize(quat_raw))
         if stage != "train":
             metrics = self.val_metrics if stage == "val" else self.test_metrics
-            metrics.update(*self._judged(pose), *self._judged(Pose(batch.position_m, batch.quat_wxyz)))
+            metrics.update(*self.select_judged(pose), *self.select_judged(Pose(batch.position_m, batch.quat_wxyz)))
         return terms["total"], pose
 
-    def _judged(self, pose: Pose) -> Pose:
-        """The part of a batch's poses that metrics count."""
+    def select_judged(self, pose: Pose) -> Pose:
+        """The part of a batch's poses that metrics count; all of them, unless some are known beforehand."""
         return pose
 
     def training_step(self, batch: PoseBatch, batch_idx: int) -> Tensor:
@@ -235,7 +264,7 @@ class PoseModule(LightningModule):
         self.log_dict({f"{stage}/{name}": value for name, value in metrics.compute().items()})
         metrics.reset()
 
-    def configure_optimizers(self) -> Any:
+    def configure_optimizers(self) -> torch.optim.Optimizer | OptimizerLRSchedulerConfig:
         # Foreach kernels: one launch for all tensors, which matters for networks as small as these.
         optimizer = torch.optim.AdamW(
             self.parameters(), lr=self.learning_rate, weight_decay=self.weight_decay, foreach=True
@@ -243,14 +272,7 @@ class PoseModule(LightningModule):
         if self.schedule == "constant":
             return optimizer
         steps = int(self.trainer.estimated_stepping_batches)
-        warmup = max(1, steps // 20)
-
-        def factor(step: int) -> float:
-            if step < warmup:
-                return (step + 1) / warmup
-            return 0.5 * (1 + math.cos(math.pi * (step - warmup) / max(1, steps - warmup)))
-
-        scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
+        scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: cosine_factor(step, steps))
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
     def describe(self) -> Spec:
@@ -258,6 +280,11 @@ class PoseModule(LightningModule):
         return {"class_path": class_path(self), "init_args": dict(self.hparams)}
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Refuse a checkpoint that does not suit this module, before any weight is loaded.
+
+        Raises:
+            CheckpointError: it is of another architecture, or its tensors have other shapes.
+        """
         saved = checkpoint.get("lightning_pose", {}).get("model", {}).get("class_path", class_path(self))
         saved = resolve_class_path(saved)
         if saved != class_path(self):
@@ -265,7 +292,6 @@ class PoseModule(LightningModule):
                 f"the checkpoint holds a {saved.rpartition('.')[2]}, not a {type(self).__name__}; "
                 "give the config it was trained with"
             )
-        self._make_room(checkpoint["state_dict"])
         own = self.state_dict()
         for name, value in checkpoint["state_dict"].items():
             if name in own and own[name].shape != value.shape:
@@ -274,19 +300,9 @@ class PoseModule(LightningModule):
                     "give the settings it was trained with, data.extractor included"
                 )
 
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        self._make_room({name.removeprefix(prefix): value for name, value in state_dict.items()})
-        super()._load_from_state_dict(state_dict, prefix, *args)
-
-    def _make_room(self, state_dict: dict[str, Tensor]) -> None:
-        """Let the memory be as long as the checkpoint's; other differences in shape are left to be refused."""
-        for name in self.memory:
-            if name in state_dict:
-                tensor = self.get_parameter(name) if name in dict(self.named_parameters()) else self.get_buffer(name)
-                tensor.data = tensor.new_zeros(len(state_dict[name]), *tensor.shape[1:])
-
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        datamodule = getattr(self.trainer, "datamodule", None)
+        """Add the specs of the module and its data, from which `Localizer` rebuilds both."""
+        datamodule = find_datamodule(self.trainer)
         checkpoint["lightning_pose"] = {
             "model": self.describe(),
             "data": datamodule.describe() if datamodule is not None else None,

@@ -1,4 +1,4 @@
-"""ClipModule: what the architectures for clips share."""
+"""ClipModule: what the architectures for clips of consecutive frames share."""
 
 from __future__ import annotations
 
@@ -7,29 +7,32 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
+from lightning_pose.data.batches import PoseDataset
+from lightning_pose.data.clip_datamodule import require_clips
+from lightning_pose.data.datamodule import SceneDataModule, scene_datamodule
 from lightning_pose.errors import ConfigError
 from lightning_pose.geometry.quaternions import quat_normalize, relative_pose
 from lightning_pose.geometry.relative import chain_steps
 from lightning_pose.models.base import Pose, PoseModule
-from lightning_pose.models.parts.motion import GEOMETRY_COLUMNS, MOTION_COLUMNS, matched_motion
+from lightning_pose.models.parts.motion import GEOMETRY_COLUMNS, MOTION_COLUMNS, measure_motion
 
 __all__ = ["ClipModule"]
 
 
 class ClipModule(PoseModule):
-    """Base of the architectures that read clips (B, T, *input_shape), any T, and say where each frame is.
+    """Base class of the architectures that read clips (B, T, *input_shape), any T, and return each frame's pose.
 
     Poses are relative to the clip's first frame (eq. 6.1), (B, T, 3) and (B, T, 4). `self.network` takes (B, T, C, H,
     W) and returns (B, T, 7); descriptors (N, D) are an image of one channel to it, raw images have three. Metrics
     leave out the first frame, whose pose is known.
 
     Args:
-        integrate: let the network say each frame's pose relative to the frame before it, and compose them. The
-            thesis's networks say the pose relative to the first frame at once, which a frame and its neighbours in
-            time do not show. For `data.relative_frame: camera`.
-        motion: let the network read where features moved since the frame before (`matched_motion`), not what they
-            look like. The descriptors of a new scene say nothing of motion, and their order even less. For
-            descriptors `with_geometry`.
+        integrate: let the network predict each frame's pose relative to the frame before it, and compose them. The
+            thesis's networks predict the pose relative to the first frame at once, which a frame and its neighbours
+            in time do not show. For `data.relative_frame: camera`.
+        motion: let the network read how features moved since the frame before (`measure_motion`) instead of their
+            descriptors. The descriptors of a new scene hold no information on motion, and their order even less.
+            For descriptors `with_geometry`.
         **kwargs: what `PoseModule` takes.
 
     Raises:
@@ -53,15 +56,15 @@ class ClipModule(PoseModule):
         self.register_buffer("motion_scale", torch.ones(MOTION_COLUMNS))
 
     @property
-    def feature_axis(self) -> int:  # type: ignore[override]
+    def feature_axis(self) -> int:
         """Columns of descriptors, channels of images."""
         return -3 if len(self.input_shape) == 3 else -1
 
     @property
     def image_shape(self) -> tuple[int, int, int]:
-        """Channels, height and width of a frame, as the network sees it."""
+        """Channels, height and width of a frame, as the network reads it."""
         if self.motion:
-            return MOTION_COLUMNS, self.input_shape[0], 1  # a filter sees all that is known of a move
+            return MOTION_COLUMNS, self.input_shape[0], 1  # so that a filter covers all columns of a move
         channels, height, width = (1, *self.input_shape)[-3:]
         return channels, height, width
 
@@ -70,9 +73,9 @@ class ClipModule(PoseModule):
         shape = f"N={self.input_shape[0]}" if len(self.input_shape) == 2 else "x".join(map(str, self.input_shape))
         return shape + " motion" * self.motion + " integrated" * self.integrate
 
-    def check_data(self, datamodule: Any) -> None:
+    def check_data(self, datamodule: SceneDataModule) -> None:
         super().check_data(datamodule)
-        frame = datamodule.relative_frame
+        frame = require_clips(datamodule).relative_frame
         if self.integrate and frame != "camera":
             raise ConfigError(
                 f"model.integrate composes camera motions, but data.relative_frame is {frame}; set camera"
@@ -81,17 +84,18 @@ class ClipModule(PoseModule):
     def setup(self, stage: str) -> None:
         super().setup(stage)
         if stage == "fit" and self.motion:
-            self._fit_motion_scale(self.trainer.datamodule.dataset("train"))  # type: ignore[attr-defined]
+            self.fit_motion_scale(scene_datamodule(self.trainer).dataset("train"))
 
-    def _fit_motion_scale(self, train: Any) -> None:
-        """Learn how far features move, from some training clips."""
+    def fit_motion_scale(self, train: PoseDataset) -> None:
+        """Learn how far features move, from 64 training clips at most."""
         chosen = range(0, len(train), -(-len(train) // 64))
-        rows = matched_motion(train.__getitems__(chosen).features).flatten(0, 2)
+        rows = measure_motion(train.__getitems__(chosen).features).flatten(0, 2)
         rows = rows[rows.any(1)]
         if len(rows) > 1:
             self.motion_scale.copy_(rows.square().mean(0).sqrt().clamp(min=1e-6))
 
-    def _training_poses(self, train: Any) -> tuple[Tensor, Tensor]:
+    def training_poses(self, train: PoseDataset) -> tuple[Tensor, Tensor]:
+        """Relative poses of all clips without their first frames, or with `integrate` those of each step."""
         position_m, quat_wxyz = train.targets()
         if self.integrate:
             before = position_m[:, :-1], quat_wxyz[:, :-1]
@@ -100,16 +104,17 @@ class ClipModule(PoseModule):
             position_m, quat_wxyz = position_m[:, 1:], quat_wxyz[:, 1:]
         return position_m.flatten(0, 1), quat_wxyz.flatten(0, 1)
 
-    def _decode(self, features: Tensor) -> tuple[Tensor, Tensor]:
+    def decode_features(self, features: Tensor) -> tuple[Tensor, Tensor]:
         if self.motion:
-            read = (matched_motion(features) / self.motion_scale).transpose(2, 3)
+            read = (measure_motion(features) / self.motion_scale).transpose(2, 3)
         else:
-            read = self._standardized(features)
+            read = self.standardize_input(features)
         images = read.reshape(*features.shape[:2], *self.image_shape)
-        position_m, quat_raw = self._unscaled(self.network(images))
+        position_m, quat_raw = self.unscale_pose(self.network(images))
         if self.integrate:
             return chain_steps(position_m[:, 1:], quat_normalize(quat_raw[:, 1:]))
         return position_m, quat_raw
 
-    def _judged(self, pose: Pose) -> Pose:
+    def select_judged(self, pose: Pose) -> Pose:
+        """All frames but the first of each clip, whose pose is known."""
         return Pose(pose.position_m[:, 1:], pose.quat_wxyz[:, 1:])

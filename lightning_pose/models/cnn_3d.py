@@ -17,14 +17,14 @@ class CNN3D(ClipModule):
     """Two convolutions of 3x3x3, each with ReLU and average pooling of 1x5x5, then two linear layers a frame.
 
     Fig. 6.2 of the thesis, which trains it with eq. 6.3: `loss: {form: split, norm: squared, orientation_weight: 250}`.
-    A frame's answer depends on the two frames before it and the two after it, whatever T is: so the network must
-    recognise where in a clip it is from these alone, unless it integrates. Pools are in ceil mode, so that as few as
-    one descriptor will do.
+    A frame's pose depends on the two frames before it and the two after it, for every T. So the network must infer
+    the frame's place in the clip from these alone, unless it integrates. Pools are in ceil mode, so that one
+    descriptor is enough.
 
     Args:
         channels: filters of both convolutions.
         units: width of the linear layer.
-        causal: let a frame's answer depend on earlier frames only, up to four of them, for a live camera.
+        causal: let a frame's pose depend on earlier frames only, up to four of them, for a live camera.
         dropout: before the last linear layer.
         **kwargs: what `ClipModule` takes.
 
@@ -42,6 +42,8 @@ class CNN3D(ClipModule):
 
 
 class _Conv3d(nn.Module):
+    """Convolutions over space and time with their pools, and two linear layers for each frame."""
+
     def __init__(self, shape: tuple[int, int, int], channels: int, units: int, causal: bool, dropout: float) -> None:
         super().__init__()
         depth, height, width = shape

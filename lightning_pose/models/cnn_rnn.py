@@ -21,7 +21,7 @@ class CNNRNN(ClipModule):
     Args:
         channels: filters of both convolutions.
         units: of the LSTM, in each direction.
-        bidirectional: let a frame's answer depend on later frames too; off, an answer is causal, for a live camera.
+        bidirectional: let a frame's pose depend on later frames too; off, it is causal, for a live camera.
         dropout: before the last linear layer.
         **kwargs: what `ClipModule` takes.
 
@@ -39,6 +39,8 @@ class CNNRNN(ClipModule):
 
 
 class _ConvLSTM(nn.Module):
+    """Convolutions over each frame, an LSTM over time, and a linear layer for each frame."""
+
     def __init__(
         self, shape: tuple[int, int, int], channels: int, units: int, bidirectional: bool, dropout: float
     ) -> None:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from lightning_pose.data.datamodule import scene_datamodule
 from lightning_pose.errors import ConfigError
 from lightning_pose.models.base import PoseModule
 from lightning_pose.models.parts.ridge import Moments
@@ -34,6 +35,7 @@ class DensePoseNet(PoseModule):
     """
 
     input_ranks: ClassVar[tuple[int, ...]] = (1,)
+    network: nn.Sequential
 
     def __init__(
         self,
@@ -60,10 +62,10 @@ class DensePoseNet(PoseModule):
 
     def setup(self, stage: str) -> None:
         super().setup(stage)
-        if stage == "fit" and self.components is not None:
-            features = self.trainer.datamodule.dataset("train").data.features  # type: ignore[attr-defined]
-            projection: _Projection = self.network[0]  # type: ignore[index, assignment]
-            projection.fit(self._standardized(features.to(self.device)))
+        first = self.network[0]
+        if stage == "fit" and isinstance(first, _Projection):
+            features = scene_datamodule(self.trainer).dataset("train").data.features
+            first.fit(self.standardize_input(features.to(self.device)))
 
 
 class _Projection(nn.Module):

@@ -1,4 +1,4 @@
-"""GraphPose: each image is a graph, its nodes the cells of a CNN's feature map (thesis, chapter 4)."""
+"""GraphPose: each image is a graph whose nodes are the cells of a CNN's feature map (thesis, chapter 4)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from lightning_pose.errors import ConfigError
 from lightning_pose.models.base import PoseModule
 from lightning_pose.models.parts.graph_conv import GraphConvolution, PoseHeads
-from lightning_pose.models.parts.neighbour_graph import edge_index, neighbours_within
+from lightning_pose.models.parts.neighbour_graph import list_edges, search_within_graph
 
 __all__ = ["GraphPose"]
 
@@ -18,19 +18,19 @@ Readout = Literal["mean", "max"]
 
 
 class GraphPose(PoseModule):
-    """Graph convolutions over the cells of a (C, h, w) map, each joined to the K cells most like it.
+    """Graph convolutions over the cells of a (C, h, w) map, each joined to the K cells with the nearest features.
 
-    The thesis's 7 x 7 cells are 49 nodes. It does not say how they are brought together at the end: here by their
-    mean or maximum.
+    The thesis's 7 x 7 cells are 49 nodes. It does not state how the nodes' states become one: here by their mean or
+    maximum.
 
     Args:
         neighbours: K.
         conv: `wl`, `gcn`, or the name of another convolution of PyG, as for `GraphConvolution`.
-        aggr: how a node brings its neighbours together: `add`, `mean`, `max`; the convolution's own way if not given.
+        aggr: how a node joins its neighbours' messages: `add`, `mean`, `max`; the convolution's own way if not given.
         channels: width of each convolution.
         dropout: before each convolution.
         readout: `mean` or `max` over the nodes.
-        places: let each node know where in the image its cell is; the thesis's do not.
+        places: add each cell's place in the image to its node's features; the thesis does not.
         **kwargs: what `PoseModule` takes.
 
     Raises:
@@ -38,7 +38,6 @@ class GraphPose(PoseModule):
     """
 
     input_ranks: ClassVar[tuple[int, ...]] = (3,)
-    feature_axis: ClassVar[int] = -3
 
     def __init__(
         self,
@@ -67,11 +66,17 @@ class GraphPose(PoseModule):
         self.network = _CellNetwork(convolutions, PoseHeads(channels[-1]), neighbours, dropout, readout, places)
 
     @property
+    def feature_axis(self) -> int:
+        return -3  # the channels of a map
+
+    @property
     def headline(self) -> str:
         return f"D={self.input_shape[0]} neighbours={self.neighbours}"
 
 
 class _CellNetwork(nn.Module):
+    """Graph convolutions over the cells of maps, a readout over each map's nodes, and the heads of the pose."""
+
     def __init__(
         self,
         convolutions: list[GraphConvolution],
@@ -91,7 +96,7 @@ class _CellNetwork(nn.Module):
         """(B, C, h, w) -> (B, 7)."""
         B, _, h, w = maps.shape
         nodes = maps.flatten(2).transpose(1, 2)
-        edges = edge_index(neighbours_within(nodes, self.neighbours))
+        edges = list_edges(search_within_graph(nodes, self.neighbours))
         if self.places:
             grid = torch.cartesian_prod(
                 torch.linspace(-1, 1, h, device=maps.device), torch.linspace(-1, 1, w, device=maps.device)

@@ -8,32 +8,34 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from lightning_pose.data.datamodule import scene_datamodule
 from lightning_pose.errors import ConfigError
-from lightning_pose.models.linear_posenet import LinearPoseNet
+from lightning_pose.models.closed_form import ClosedFormModule, LinearNetwork
+from lightning_pose.models.parts.memory import TrainingMemory
 from lightning_pose.models.parts.ridge import Ridge
 
 __all__ = ["KernelPoseNet"]
 
 
-class KernelPoseNet(LinearPoseNet):
+class KernelPoseNet(TrainingMemory, ClosedFormModule):
     """Kernel ridge regression from (D,) features to the pose (Saunders et al., ICML 1998), without gradients.
 
     The kernel between two images is exp(-gamma d^2 / m): d is the distance between their features, m the median of
     d^2 between landmarks. With all training frames as landmarks, validation frames included where `refit` learns
     from them, this is kernel ridge regression itself; with fewer its Nystroem approximation (Williams & Seeger, NIPS
-    2000), in one streaming pass like LinearPoseNet's. The checkpoint carries the landmarks' features.
+    2000), in one streaming pass as for LinearPoseNet. The checkpoint carries the landmarks' features.
 
-    Not in the thesis: its nearest relative is LinearPoseNet, which this becomes as gamma goes to 0.
+    It is not in the thesis. As gamma goes to 0 it becomes the thesis's LinearPoseNet.
 
     Args:
         lambdas: ridge strengths to choose from; 1 is as strong as one frame.
         gamma: how fast the kernel falls with distance: at the median distance it is exp(-gamma).
         landmarks: how many frames to keep at most, evenly spaced.
         normalize: measure distances between features of unit length, as image retrieval does.
-        **kwargs: what `LinearPoseNet` takes.
+        **kwargs: what `ClosedFormModule` takes.
 
     Raises:
-        ConfigError: a number is not positive, or as for `LinearPoseNet`.
+        ConfigError: a number is not positive, or as for `ClosedFormModule`.
     """
 
     memory: ClassVar[tuple[str, ...]] = ("network.landmarks", "network.weight")
@@ -61,13 +63,13 @@ class KernelPoseNet(LinearPoseNet):
     def setup(self, stage: str) -> None:
         super().setup(stage)
         if stage == "fit":
-            datamodule = self.trainer.datamodule  # type: ignore[attr-defined]
-            features = torch.cat([datamodule.dataset(split).data.features for split in self.learns_from])
+            datamodule = scene_datamodule(self.trainer)
+            features = torch.cat([datamodule.dataset(split).data.features for split in self.training_splits])
             kept = torch.linspace(0, len(features) - 1, min(self.landmarks, len(features))).round().long()
-            self.network.remember(self._standardized(features[kept].to(self.device)), self.gamma)
+            self.network.set_landmarks(self.standardize_input(features[kept].to(self.device)), self.gamma)
 
 
-class _KernelMachine(nn.Module):
+class _KernelMachine(LinearNetwork):
     """Seven numbers, linear in an image's kernels with M landmarks.
 
     In double precision throughout: solutions cancel large numbers.
@@ -87,13 +89,12 @@ class _KernelMachine(nn.Module):
         self._basis = torch.zeros(0, 0)  # (M, R), from kernels to coordinates whose products are kernels again
 
     @property
-    def n_features(self) -> int:
-        """R: how many numbers `lift` gives."""
+    def n_lifted(self) -> int:
         return self._basis.shape[1]
 
-    def remember(self, landmarks: Tensor, gamma: float) -> None:
-        """Take in (M, D) landmarks."""
-        self.landmarks = self._key(landmarks)
+    def set_landmarks(self, landmarks: Tensor, gamma: float) -> None:
+        """Keep (M, D) landmarks, measure their spread, and make the basis of `lift`."""
+        self.landmarks = self._to_keys(landmarks)
         self.weight.data = self.weight.new_zeros(len(landmarks), 7)
         sample = self.landmarks[:: -(-len(landmarks) // 1000)].double()
         squared = F.pdist(sample).square()
@@ -104,19 +105,18 @@ class _KernelMachine(nn.Module):
         self._basis = vectors[:, kept] / values[kept].sqrt()
 
     def lift(self, features: Tensor) -> Tensor:
-        """(B, D) -> (B, R): images' products with each other are their kernels."""
-        return self._kernel(self._key(features)) @ self._basis
+        """(B, D) -> (B, R), whose products with each other are the images' kernels."""
+        return self._kernel(self._to_keys(features)) @ self._basis
 
-    def take(self, solution: Ridge) -> None:
-        """Become this solution, which is linear in `lift`."""
+    def set_solution(self, solution: Ridge) -> None:
         self.weight.copy_(self._basis @ solution.weight.T)
         self.bias.copy_(solution.bias)
 
     def forward(self, features: Tensor) -> Tensor:
-        """(B, D) -> (B, 7)."""
-        return (self._kernel(self._key(features)) @ self.weight + self.bias).to(features.dtype)
+        return (self._kernel(self._to_keys(features)) @ self.weight + self.bias).to(features.dtype)
 
-    def _key(self, features: Tensor) -> Tensor:
+    def _to_keys(self, features: Tensor) -> Tensor:
+        """What distances are measured between, (B, D)."""
         return F.normalize(features, dim=-1) if self.normalize else features
 
     def _kernel(self, keys: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""NodePose: each image is a node, joined to the training images most like it (thesis, chapter 4)."""
+"""NodePose: each image is a node, joined to the training images with the nearest features (thesis, chapter 4)."""
 
 from __future__ import annotations
 
@@ -10,37 +10,44 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from lightning_pose.data.batches import PoseBatch
+from lightning_pose.data.datamodule import scene_datamodule
 from lightning_pose.errors import ConfigError
 from lightning_pose.geometry.quaternions import align_hemisphere
 from lightning_pose.models.base import PoseModule
 from lightning_pose.models.parts.graph_conv import GraphConvolution, PoseHeads
-from lightning_pose.models.parts.neighbour_graph import edge_index, neighbourhood, sample_neighbours, search_neighbours
+from lightning_pose.models.parts.memory import TrainingMemory
+from lightning_pose.models.parts.neighbour_graph import (
+    find_neighbourhood,
+    list_edges,
+    sample_neighbours,
+    search_neighbours,
+)
 
 __all__ = ["NodePose"]
 
 _CHUNK = 1024  # nodes whose neighbours' states are gathered at a time
 
 
-class NodePose(PoseModule):
+class NodePose(TrainingMemory, PoseModule):
     """Graph convolutions over images: each node has edges from the K nearest training images in feature space.
 
     All edges start at training images; they end at queries and at training images. So queries never affect each other,
-    and the training images' states, computed once, serve them all. The training images' features are part of the
+    and the training images' states are computed once for all queries. The training images' features are part of the
     checkpoint.
 
-    The thesis's form has `neighbour_poses: 0`: what a node learns of its neighbours are features. But they are posed,
-    and a new image is nearer to its neighbours than any regression of its pose is: so here the network's errors on
-    the nearest neighbours correct its answer, as in Correct and Smooth (Huang et al., ICLR 2021). The answer is
+    The thesis's form has `neighbour_poses: 0`: a node receives only its neighbours' features. But their poses are
+    known, and a new image is nearer to its neighbours than any regression of its pose. So here the network's errors
+    on the nearest neighbours correct its answer, as in Correct and Smooth (Huang et al., ICLR 2021). The answer is
 
-        mean over the neighbours j of (pose_j + slope * (network(query) - network(j))),
+        mean over the neighbours j of (pose_j + slope * (network(query) - network(j))).
 
-    image retrieval for a slope of 0, the network with its neighbours' errors taken off for 1. It is trained as the
-    thesis's is, so that no node sees its own pose.
+    A slope of 0 is image retrieval; a slope of 1 is the network less its neighbours' errors. It is trained as the
+    thesis's is, so that no node receives its own pose.
 
     Args:
         neighbours: K.
         conv: `wl`, `gcn`, or the name of another convolution of PyG, as for `GraphConvolution`.
-        aggr: how a node brings its neighbours together: `add`, `mean`, `max`; the convolution's own way if not given.
+        aggr: how a node joins its neighbours' messages: `add`, `mean`, `max`; the convolution's own way if not given.
         channels: width of each convolution.
         dropout: before each convolution.
         normalize: search neighbours by L2 between features of unit length, as image retrieval does.
@@ -98,11 +105,11 @@ class NodePose(PoseModule):
         self.full_graph_limit = full_graph_limit
         self.fanout = fanout
         self.network = _NodeNetwork([self.input_shape[0], *channels], conv, aggr, dropout)
-        # Their length is the training split's; `_make_room` gives them a checkpoint's.
         self.register_buffer("memory_features", torch.zeros(0, *self.input_shape))
         self.register_buffer("memory_pose", torch.zeros(0, 7))
         self.register_buffer("memory_frame", torch.zeros(0, dtype=torch.int64))
         self.register_buffer("memory_table", torch.zeros(0, neighbours, dtype=torch.int64))
+        self.register_load_state_dict_post_hook(_forget_states)
         self._memory: _Memory | None = None
 
     @property
@@ -112,69 +119,78 @@ class NodePose(PoseModule):
     def setup(self, stage: str) -> None:
         super().setup(stage)
         if stage == "fit":
-            self.remember(self.trainer.datamodule.dataset("train").data)  # type: ignore[attr-defined]
+            self.store_training(scene_datamodule(self.trainer).dataset("train").data)
 
-    def remember(self, train: PoseBatch) -> None:
+    def store_training(self, train: PoseBatch) -> None:
         """Store the training images, once the scale of poses is known, and join them by edges."""
         train = PoseBatch(*(tensor[train.frame.argsort()].to(self.device) for tensor in train))
         pose = torch.cat([train.position_m, align_hemisphere(train.quat_wxyz, self.quat_reference)], dim=-1)
         self.memory_features = train.features
         self.memory_pose = (pose - self.pose_mean) / self.pose_scale
         self.memory_frame = train.frame
-        keys = self._key(train.features)
+        keys = self._to_keys(train.features)
         self.memory_table = search_neighbours(keys, keys, self.neighbours, train.frame, train.frame, self.gap)
-        self._memory = None
+        self.forget_states()
 
-    def _decode(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        memory = self._remembered()
-        table = search_neighbours(self._key(features), memory.keys, self.neighbours)
-        target = self._standardized(features)
-        for layer, source in enumerate(memory.states):
-            target = self.network.hear(layer, target, source, table)
-        pose = self.network.heads(target)
+    def decode_features(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        memory = self._compute_memory()
+        table = search_neighbours(self._to_keys(features), memory.keys, self.neighbours)
+        pose = self.network(self.standardize_input(features), memory.states, table)
         if self.neighbour_poses:
-            pose = self.slope * pose + _mean_of_neighbours(memory.offset, table[:, : self.neighbour_poses])
-        return self._unscaled(pose)
+            pose = self.slope * pose + _average_neighbours(memory.offset, table[:, : self.neighbour_poses])
+        return self.unscale_pose(pose)
 
-    def _decode_batch(self, batch: PoseBatch) -> tuple[Tensor, Tensor]:
+    def decode_batch(self, batch: PoseBatch) -> tuple[Tensor, Tensor]:
         if not self.training:
-            return self._decode(batch.features)
-        self._memory = None  # weights are about to change
+            return self.decode_features(batch.features)
+        self.forget_states()  # weights are about to change
         rows, table = torch.searchsorted(self.memory_frame, batch.frame), self.memory_table
         features = self.memory_features
         if len(table) > self.full_graph_limit:
             table = sample_neighbours(table, self.fanout)
-            nodes, table, rows = neighbourhood(table, rows, hops=len(self.network.convolutions))
+            nodes, table, rows = find_neighbourhood(table, rows, hops=len(self.network.convolutions))
             features = features[nodes]
-        *_, last = self.network.states(self._standardized(features), table)
-        answer = self.network.hear(len(self.network.convolutions) - 1, last[rows], last, table[rows])
-        return self._unscaled(self.network.heads(answer))
+        *_, last = self.network.compute_states(self.standardize_input(features), table)
+        answer = self.network.convolve(len(self.network.convolutions) - 1, last[rows], last, table[rows])
+        return self.unscale_pose(self.network.heads(answer))
 
-    def _remembered(self) -> _Memory:
-        """What queries are compared with and what they receive; computed when first needed."""
+    def forget_states(self) -> None:
+        """Drop the training images' states; they are computed again when next needed."""
+        self._memory = None
+
+    def _compute_memory(self) -> _Memory:
+        """What queries are compared with and what they receive, computed when first needed."""
         if self._memory is None or self._memory.keys.device != self.device:
             with torch.inference_mode(False), torch.no_grad():
-                states = self.network.states(self._standardized(self.memory_features), self.memory_table)
-                answer = self.network.heads(self.network.hear_all(len(states) - 1, states[-1], self.memory_table))
+                states = self.network.compute_states(self.standardize_input(self.memory_features), self.memory_table)
+                answer = self.network.heads(self.network.convolve_all(len(states) - 1, states[-1], self.memory_table))
                 offset = self.memory_pose - self.slope * answer
-                self._memory = _Memory(self._key(self.memory_features), states, offset)
+                self._memory = _Memory(self._to_keys(self.memory_features), states, offset)
         return self._memory
 
-    def _key(self, features: Tensor) -> Tensor:
+    def _to_keys(self, features: Tensor) -> Tensor:
+        """What distances are measured between, (B, D)."""
         return F.normalize(features, dim=-1) if self.normalize else features
 
     def train(self, mode: bool = True) -> NodePose:
-        self._memory = None
+        self.forget_states()
         return super().train(mode)
 
-    def _make_room(self, state_dict: dict[str, Tensor]) -> None:
-        self._memory = None
-        super()._make_room(state_dict)
+
+def _forget_states(module: nn.Module, _: object) -> None:
+    """`load_state_dict` calls this once the weights have changed."""
+    assert isinstance(module, NodePose)
+    module.forget_states()
 
 
 class _Memory(NamedTuple):
-    """What N training images are to a query: `keys` (N, D) it is compared with, `states` (N, C) that each convolution
-    receives, and `offset` (N, 7), the scaled pose less the slope's part of the network's answer."""
+    """What queries need of N training images.
+
+    Attributes:
+        keys: (N, D) that queries are compared with.
+        states: (N, C) that each convolution receives.
+        offset: (N, 7), the scaled pose less the slope's part of the network's answer.
+    """
 
     keys: Tensor
     states: list[Tensor]
@@ -182,34 +198,52 @@ class _Memory(NamedTuple):
 
 
 class _NodeNetwork(nn.Module):
+    """Graph convolutions, and the heads that make a pose of a node's last state."""
+
     def __init__(self, widths: list[int], conv: str, aggr: str | None, dropout: float) -> None:
         super().__init__()
         self.convolutions = nn.ModuleList(GraphConvolution(conv, *pair, aggr) for pair in pairwise(widths))
         self.dropout = nn.Dropout(dropout)
         self.heads = PoseHeads(widths[-1])
 
-    def states(self, features: Tensor, table: Tensor) -> list[Tensor]:
+    def forward(self, features: Tensor, states: list[Tensor], table: Tensor) -> Tensor:
+        """Numbers of targets whose neighbours' states are known.
+
+        Args:
+            features: (B, D) of the targets.
+            states: (M, C) that each convolution reads of the sources, as `compute_states` returns them.
+            table: (B, K) rows of the sources that are each target's neighbours.
+
+        Returns:
+            (B, 7).
+        """
+        target = features
+        for layer, source in enumerate(states):
+            target = self.convolve(layer, target, source, table)
+        return self.heads(target)
+
+    def compute_states(self, features: Tensor, table: Tensor) -> list[Tensor]:
         """What each convolution reads of N nodes, their (N, D) features first, for their graph (N, K)."""
         states = [features]
         for layer in range(len(self.convolutions) - 1):
-            states.append(self.hear_all(layer, states[-1], table))
+            states.append(self.convolve_all(layer, states[-1], table))
         return states
 
-    def hear_all(self, layer: int, state: Tensor, table: Tensor) -> Tensor:
+    def convolve_all(self, layer: int, state: Tensor, table: Tensor) -> Tensor:
         """One convolution over all N nodes of a graph, some at a time."""
         parts = zip(state.split(_CHUNK), table.split(_CHUNK), strict=True)
-        return torch.cat([self.hear(layer, target, state, rows) for target, rows in parts])
+        return torch.cat([self.convolve(layer, target, state, rows) for target, rows in parts])
 
-    def hear(self, layer: int, target: Tensor, source: Tensor, table: Tensor) -> Tensor:
+    def convolve(self, layer: int, target: Tensor, source: Tensor, table: Tensor) -> Tensor:
         """(B, C) states of targets after a convolution over the (M, C) sources that `table` (B, K) joins them to."""
-        source_row, target_row = edge_index(table)
+        source_row, target_row = list_edges(table)
         used, source_row = source_row.unique(return_inverse=True)
         target, source = self.dropout(target), self.dropout(source[used])
         return self.convolutions[layer](target, source, torch.stack([source_row, target_row])).relu()
 
 
-def _mean_of_neighbours(rows: Tensor, table: Tensor) -> Tensor:
+def _average_neighbours(rows: Tensor, table: Tensor) -> Tensor:
     """(B, 7) mean of the rows of (M, 7) that `table` (B, K) joins each target to; zero where there are none."""
-    source, target = edge_index(table)
+    source, target = list_edges(table)
     count = target.bincount(minlength=len(table)).clamp(min=1).unsqueeze(1)
     return rows.new_zeros(len(table), 7).index_add(0, target, rows[source]) / count

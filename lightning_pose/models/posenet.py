@@ -1,4 +1,4 @@
-"""PoseNet: a pretrained CNN fine-tuned from end to end, the peer that cheaper systems are measured against."""
+"""PoseNet: a pretrained CNN fine-tuned from end to end, with which cheaper systems are compared."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ __all__ = ["PoseNet"]
 class PoseNet(PoseModule):
     """A CNN, a fully connected layer and the pose, all trained (Kendall et al., ICCV 2015), from (3, H, W) images.
 
-    In training each image is cut at random, otherwise in the middle. The learned balance of position and
+    In training each image is cropped at a random place, otherwise in the middle. The learned balance of position and
     orientation of Kendall & Cipolla (CVPR 2017) is `loss: {form: split, learned_weights: true}`, the fixed one
     `orientation_weight`. `trainer.precision: 16-mixed` halves time and memory on a GPU, and `bf16-mixed` on CPUs
     that have bfloat16; poses and loss stay in single precision.
 
-    The pretrained weights are read when training starts: a checkpoint needs them no more.
+    The pretrained weights are read when training starts; a checkpoint does not need them.
 
     Args:
         backbone: a CNN, as for `lightning_pose.features.backbones.build_backbone`.
@@ -67,7 +67,7 @@ class PoseNet(PoseModule):
         self.weights = weights
         self.crop = crop
         cnn = build_backbone(backbone, "none" if backbone in BACKBONES else "imagenet")
-        self.network = _FineTuned(cnn.train().requires_grad_(True), _width(cnn, backbone, crop), units, dropout)
+        self.network = _FineTuned(cnn.train().requires_grad_(True), _measure_width(cnn, backbone, crop), units, dropout)
 
     @property
     def headline(self) -> str:
@@ -78,17 +78,19 @@ class PoseNet(PoseModule):
         if stage == "fit":
             self.network.cnn.load_state_dict(build_backbone(self.backbone, self.weights).state_dict())
 
-    def _decode(self, features: Tensor) -> tuple[Tensor, Tensor]:
+    def decode_features(self, features: Tensor) -> tuple[Tensor, Tensor]:
         top, left = ((size - self.crop) // 2 for size in features.shape[-2:])
-        return super()._decode(features[..., top : top + self.crop, left : left + self.crop])
+        return super().decode_features(features[..., top : top + self.crop, left : left + self.crop])
 
-    def _decode_batch(self, batch: PoseBatch) -> tuple[Tensor, Tensor]:
+    def decode_batch(self, batch: PoseBatch) -> tuple[Tensor, Tensor]:
         if not self.training:
-            return self._decode(batch.features)
-        return super()._decode(_random_crops(batch.features, self.crop))
+            return self.decode_features(batch.features)
+        return super().decode_features(_crop_at_random(batch.features, self.crop))
 
 
 class _FineTuned(nn.Module):
+    """A CNN with pooled output, and two linear layers."""
+
     def __init__(self, cnn: nn.Module, width: int, units: int, dropout: float) -> None:
         super().__init__()
         # The layout that convolutions prefer: 0.6 of the time of a step of EfficientNet-Lite0 on a CPU.
@@ -97,28 +99,29 @@ class _FineTuned(nn.Module):
 
     def forward(self, pixels: Tensor) -> Tensor:
         """(B, 3, h, w) RGB in 0..255 -> (B, 7)."""
-        vector = _pooled(self.cnn((pixels.float() / 255).contiguous(memory_format=torch.channels_last)))
+        vector = _pool_cells(self.cnn((pixels.float() / 255).contiguous(memory_format=torch.channels_last)))
         with torch.autocast(pixels.device.type, enabled=False):  # half precision would round poses to centimetres
             return self.head(vector.float())
 
 
-def _pooled(out: Tensor) -> Tensor:
+def _pool_cells(out: Tensor) -> Tensor:
+    """(B, C, h, w) or (B, C) -> (B, C)."""
     return out.mean((2, 3)) if out.ndim == 4 else out
 
 
-def _random_crops(images: Tensor, side: int) -> Tensor:
-    """(B, 3, side, side), each cut out of its (3, H, W) at a place of its own."""
+def _crop_at_random(images: Tensor, side: int) -> Tensor:
+    """(B, 3, side, side): a square of each (3, H, W) image, each at its own random place."""
     rows, columns = (torch.randint(size - side + 1, (len(images),)).tolist() for size in images.shape[-2:])
     cut = zip(images, rows, columns, strict=True)
     return torch.stack([image[:, top : top + side, left : left + side] for image, top, left in cut])
 
 
 @torch.no_grad()
-def _width(cnn: nn.Module, backbone: str, crop: int) -> int:
-    """How many columns the CNN's pooled answer has."""
+def _measure_width(cnn: nn.Module, backbone: str, crop: int) -> int:
+    """How many columns the CNN's pooled output has."""
     training = cnn.training
     try:
-        out = _pooled(cnn.eval()(torch.zeros(1, 3, crop, crop)))
+        out = _pool_cells(cnn.eval()(torch.zeros(1, 3, crop, crop)))
     except RuntimeError as error:
         raise ConfigError(
             f"{backbone} cannot take a crop of {crop} ({error}); give a larger one, such as 224"

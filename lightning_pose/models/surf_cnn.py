@@ -15,14 +15,14 @@ __all__ = ["SurfCNN"]
 
 
 class SurfCNN(PoseModule):
-    """Convolutions over (N, D) descriptors, strongest first, seen as an image of one channel.
+    """Convolutions over (N, D) descriptors, strongest first, as an image of one channel (thesis, table 2.1).
 
-    Table 2.1 of the thesis. It pools after every convolution. The descriptor's 64 elements can be halved that often;
-    the N features cannot, or table 2.2's parameter counts are not met. So the first three pools are 2x2 and the last
-    two 1x2, along the descriptor, in ceil mode. Each convolution is followed by ReLU, batch normalisation and its pool.
+    Each convolution is followed by ReLU, batch normalisation and a pool. The descriptor's 64 elements can be halved
+    that often; the N features cannot, or table 2.2's parameter counts are not met. So the first three pools are 2x2
+    and the last two 1x2, along the descriptor, in ceil mode.
 
-    The order by strength changes from frame to frame. With `ordered` off, kernels, strides and pools reach along
-    each descriptor alone, and the maps are averaged over the features, so that their order does not matter.
+    The order by strength changes from frame to frame. With `ordered` off, kernels, strides and pools extend along
+    each descriptor only, and the maps are averaged over the features, so that their order does not matter.
 
     Args:
         channels: filters of each convolution.
@@ -31,7 +31,7 @@ class SurfCNN(PoseModule):
             have, if not given.
         units: width of the fully connected layer.
         dropout: before the last linear layer.
-        ordered: whether it matters which feature is stronger than which; it does in the thesis.
+        ordered: whether the result depends on the order of the features; it does in the thesis.
         **kwargs: what `PoseModule` takes.
 
     Raises:
@@ -68,6 +68,8 @@ class SurfCNN(PoseModule):
 
 
 class _ConvRegressor(nn.Module):
+    """The convolutions with their pools, and two linear layers."""
+
     def __init__(
         self,
         input_shape: tuple[int, ...],

@@ -1,4 +1,4 @@
-"""SurfLSTM: a recurrent network that reads descriptors from the strongest to the weakest (thesis, chapter 3)."""
+"""SurfLSTM: a recurrent network over descriptors in the order of their strength (thesis, chapter 3)."""
 
 from __future__ import annotations
 
@@ -60,6 +60,8 @@ class SurfLSTM(PoseModule):
 
 
 class _RecurrentRegressor(nn.Module):
+    """Recurrent layers, and a linear layer on the final states of the last one."""
+
     def __init__(
         self,
         cell: type[nn.LSTM | nn.GRU | nn.RNN],

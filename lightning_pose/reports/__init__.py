@@ -1,1 +1,1 @@
-"""Reports: `store` reads runs, `select` filters them, `compare` refuses mixtures, `tables` joins them, others show."""
+"""Reports: `filters` select runs, `comparability` refuses mixtures, `table` joins runs, `*_rows` add reference rows."""

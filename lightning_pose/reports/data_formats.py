@@ -6,15 +6,12 @@ import csv
 import io
 import json
 import math
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections.abc import Iterator, Mapping
 
-from lightning_pose.reports.table import SKILLS, Cell, Mean, Report, Row, over_scenes
-from lightning_pose.reports.text_formats import HEADINGS
+from lightning_pose.metrics.catalog import COSTS, MEDIANS, SKILLS
+from lightning_pose.reports.table import STANDARD_DEVIATIONS, Cell, Report, Row
 
 __all__ = ["as_csv", "as_json"]
-
-ERRORS = ("position_median_m", "orientation_median_deg", "position_std_m", "orientation_std_deg")
 
 
 def as_csv(report: Report) -> str:
@@ -24,10 +21,10 @@ def as_csv(report: Report) -> str:
     their mean where there are several. `kind` is own, baseline or published; `n` is how many runs a cell has, or how
     many scenes a mean is over; `runs` are MLflow's ids, separated by spaces.
     """
-    facts = list(dict.fromkeys(fact for told in report.facts.values() for fact in told))
-    columns = ["features", "scene", *ERRORS, "n", *SKILLS, *HEADINGS, *facts, "source", "runs"]
-    asked = next((row.settings for row in report.rows if row.kind == "own"), {})
-    by = [name for name in asked if name not in ("kind", "system", *columns)]
+    facts = list(dict.fromkeys(fact for scene in report.scenes for fact in report.facts[scene]))
+    errors = (*MEDIANS, *STANDARD_DEVIATIONS)
+    columns = ["features", "scene", *errors, "n", *SKILLS, *COSTS, *facts, "source", "runs"]
+    by = [name for row in report.rows[:1] for name in row.settings if name not in ("kind", "system", *columns)]
     out = io.StringIO()
     writer = csv.DictWriter(out, ["kind", "system", *by, *columns], lineterminator="\n")
     writer.writeheader()
@@ -35,39 +32,31 @@ def as_csv(report: Report) -> str:
         about = {"kind": row.kind, "system": row.system, "source": row.source}
         about |= {name: row.settings.get(name, "") for name in by}
         about |= {} if row.kind == "published" else {"features": row.features}
-        writer.writerows({**about, **line} for line in _lines(row, report))
+        writer.writerows({**about, **line} for line in _list_lines(row, report))
     return out.getvalue().rstrip("\n")
 
 
-def _lines(row: Row, report: Report) -> Iterator[dict[str, Any]]:
-    """The cells of a row, and then its means."""
-    for scene, cell in row.cells.items():
-        told = dict(zip(ERRORS, map(_text, _errors(cell)), strict=True))
-        runs = " ".join(run.run_id for run in cell.runs)
-        yield {"scene": scene, **told, "n": len(cell.runs) or "", "runs": runs, **_beside(row, report, [scene])}
-    for column, mean in row.means.items():
-        told = dict(zip(ERRORS[:2], map(_text, (mean.position_m, mean.orientation_deg)), strict=True))
-        yield {"scene": column, **told, "n": mean.scenes, **_beside(row, report, report.means[column])}
-
-
-def _beside(row: Row, report: Report, scenes: Sequence[str]) -> dict[str, str]:
-    """Costs and skill of a system on some scenes, and the facts that these share; nothing for what is published."""
-    if row.kind == "published":
-        return {}
-    told = [report.facts[scene] for scene in scenes]
-    shared = {fact: value for fact, value in told[0].items() if all(facts.get(fact) == value for facts in told)}
-    if row.kind == "baseline":
-        return shared
-    cells = {scene: row.cells[scene] for scene in scenes if scene in row.cells}
-    metrics = {name: f"test/{name}" for name in SKILLS} | {name: f"cost/{name}" for name in HEADINGS}
-    return shared | {name: _text(value) for name, value in over_scenes(cells, metrics).items()}
+def _list_lines(row: Row, report: Report) -> Iterator[dict[str, object]]:
+    """The cells of a row, and then its means: errors, skill, costs, and the facts that the scenes share."""
+    for (column, cell), is_mean in [*((c, False) for c in row.cells.items()), *((m, True) for m in row.means.items())]:
+        scenes = report.means[column] if is_mean else [column]
+        first, *others = (report.facts[scene] for scene in scenes)
+        shared = {fact: value for fact, value in first.items() if all(other.get(fact) == value for other in others)}
+        yield {
+            "scene": column,
+            **cell.values,
+            "n": cell.scenes if is_mean else len(cell.runs) or None,
+            **row.average_costs(scenes),
+            **({} if row.kind == "published" else shared),
+            "runs": " ".join(run.run_id for run in cell.runs),
+        }
 
 
 def as_json(report: Report) -> str:
     """Scenes with their facts, rows with cells, runs and settings, the rule, notes and sources; no NaN: null."""
     document = {
         "scenes": [{"name": scene, **report.facts[scene]} for scene in report.scenes],
-        "rows": [_row(row) for row in report.rows],
+        "rows": [_row_document(row) for row in report.rows],
         "rule": report.rule,
         "notes": report.notes,
         "sources": report.footnotes,
@@ -75,53 +64,38 @@ def as_json(report: Report) -> str:
     return json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False)
 
 
-def _row(row: Row) -> dict[str, Any]:
+def _row_document(row: Row) -> dict[str, object]:
+    averages = _replace_infinite(row.average_costs())
     return {
         "kind": row.kind,
         "system": row.system,
         "features": None if row.kind == "published" else row.features,
         "settings": dict(row.settings),
-        "cells": {scene: _cell(cell) for scene, cell in row.cells.items()},
-        "means": {column: _mean(mean) for column, mean in row.means.items()},
-        "skill": {name: _finite(value) for name, value in row.skill.items()},
-        "costs": {name: _finite(value) for name, value in row.costs.items()},
+        "cells": {scene: _cell_document(cell) for scene, cell in row.cells.items()},
+        "means": {
+            column: _replace_infinite({name: mean.values[name] for name in MEDIANS}) | {"scenes": mean.scenes}
+            for column, mean in row.means.items()
+        },
+        "skill": {name: value for name, value in averages.items() if name in SKILLS},
+        "costs": {name: value for name, value in averages.items() if name in COSTS},
         "source": row.source or None,
     }
 
 
-def _mean(mean: Mean) -> dict[str, Any]:
-    return {
-        "position_median_m": _finite(mean.position_m),
-        "orientation_median_deg": _finite(mean.orientation_deg),
-        "scenes": mean.scenes,
-    }
+def _cell_document(cell: Cell) -> dict[str, object]:
+    runs = [
+        {
+            "run_id": run.run_id,
+            "name": run.name,
+            "experiment": run.experiment,
+            "settings": dict(run.params),
+            "metrics": _replace_infinite(run.metrics),
+        }
+        for run in cell.runs
+    ]
+    return {**_replace_infinite(cell.values), "candidates": cell.candidates, "runs": runs}
 
 
-def _cell(cell: Cell) -> dict[str, Any]:
-    told = dict(zip(ERRORS, map(_finite, _errors(cell)), strict=True))
-    return {
-        **told,
-        "candidates": cell.candidates,
-        "runs": [
-            {
-                "run_id": run.run_id,
-                "name": run.name,
-                "experiment": run.experiment,
-                "settings": dict(run.params),
-                "metrics": {name: _finite(value) for name, value in run.metrics.items()},
-            }
-            for run in cell.runs
-        ],
-    }
-
-
-def _errors(cell: Cell) -> tuple[float | None, ...]:
-    return cell.position_m, cell.orientation_deg, cell.position_std_m, cell.orientation_std_deg
-
-
-def _text(value: float | None) -> str:
-    return "" if value is None else repr(value)
-
-
-def _finite(value: float | None) -> float | None:
-    return value if value is not None and math.isfinite(value) else None
+def _replace_infinite(values: Mapping[str, float | None]) -> dict[str, float | None]:
+    """The values, with None for those that are infinite or not a number."""
+    return {name: v if v is not None and math.isfinite(v) else None for name, v in values.items()}

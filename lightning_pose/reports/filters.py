@@ -6,43 +6,36 @@ import difflib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
-from typing import NamedTuple
 
 from lightning_pose.errors import ConfigError
+from lightning_pose.metrics.catalog import MEDIANS
 from lightning_pose.runs.reader import Run
 
-__all__ = ["Date", "Filters", "check_setting", "read_date", "select_runs", "setting"]
+__all__ = ["Filters", "check_setting", "read_date", "select_runs"]
 
-MOST = 12
-
-
-class Date(NamedTuple):
-    """A moment, in milliseconds since 1970 as MLflow counts them, and the text that the user gave for it."""
-
-    text: str
-    milliseconds: float
+MOST = 12  # values that a message lists
 
 
 @dataclass(frozen=True)
 class Filters:
-    """What the runs must be; nothing is asked by default, but that no sweep ran them.
+    """What the runs must be; by default every run that no sweep made.
 
     Attributes:
-        experiment: name of the MLflow experiment.
+        experiments: names of MLflow experiments.
         systems: architectures.
         scenes: names of scenes.
         tags: (name, value) of tags or settings; values of one name are alternatives.
-        since: when they started, at the earliest.
-        until: when they started, before this.
+        since: when they started, at the earliest: an ISO date or time.
+        until: when they started, before this time or the end of this day.
         trials: runs of sweeps as well.
     """
 
-    experiment: str | None = None
-    systems: tuple[str, ...] = ()
-    scenes: tuple[str, ...] = ()
-    tags: tuple[tuple[str, str], ...] = ()
-    since: Date | None = None
-    until: Date | None = None
+    experiments: Sequence[str] = ()
+    systems: Sequence[str] = ()
+    scenes: Sequence[str] = ()
+    tags: Sequence[tuple[str, str]] = ()
+    since: str | None = None
+    until: str | None = None
     trials: bool = False
 
 
@@ -55,36 +48,27 @@ def select_runs(runs: Sequence[Run], filters: Filters) -> tuple[list[Run], list[
     Raises:
         ConfigError: nothing passes; the message names the filter and the values that exist.
     """
-    notes = []
     kept = [run for run in runs if filters.trials or not run.trial]
     if not kept:
         raise ConfigError(f"all {len(runs)} finished runs are trials of sweeps; give --trials, or train with `fit`")
-    kept = _keep_values(
-        kept, "--experiment", [filters.experiment] if filters.experiment else [], lambda r: r.experiment
-    )
-    kept = _keep_values(kept, "--system", filters.systems, lambda run: run.system)
-    kept = _keep_values(kept, "--scene", filters.scenes, lambda run: run.scene)
+    kept = _keep_values(kept, "--experiment ", filters.experiments, lambda run: run.experiment)
+    kept = _keep_values(kept, "--system ", filters.systems, lambda run: run.system)
+    kept = _keep_values(kept, "--scene ", filters.scenes, lambda run: run.scene)
     for name in dict.fromkeys(name for name, _ in filters.tags):
         check_setting(name, kept)
         wanted = [value for other, value in filters.tags if other == name]
-        kept = _keep_values(kept, f"--tag {name}=", wanted, lambda run, name=name: setting(run, name))
-    kept = _keep_dates(kept, filters)
-    tested = [run for run in kept if "test/position_median_m" in run.metrics]
-    missing = len(kept) - len(tested)
+        kept = _keep_values(kept, f"--tag {name}=", wanted, lambda run, name=name: run.settings.get(name))
+    kept = _keep_dates(kept, filters.since, filters.until)
+    tested = [run for run in kept if f"test/{MEDIANS[0]}" in run.metrics]
     if not tested:
         trials = " (trials of a sweep never see test frames)" if any(run.trial for run in kept) else ""
         raise ConfigError(
             f"none of the {len(kept)} runs has test errors{trials}; "
             "measure a checkpoint with `python -m lightning_pose test --ckpt_path CKPT`"
         )
-    if missing:
-        notes.append(f"{missing} of {len(kept)} runs have no test errors, as most trials of sweeps: left out")
-    return tested, notes
-
-
-def setting(run: Run, name: str) -> str | None:
-    """A tag or a parameter by its name; None where the run has none."""
-    return run.settings.get(name)
+    missing = len(kept) - len(tested)
+    note = f"{missing} of {len(kept)} runs have no test errors, as most trials of sweeps: left out"
+    return tested, [note] if missing else []
 
 
 def check_setting(name: str, runs: Iterable[Run]) -> None:
@@ -98,11 +82,11 @@ def check_setting(name: str, runs: Iterable[Run]) -> None:
         return
     near = [other for other in known if other.rpartition(".")[2] == name] or difflib.get_close_matches(name, known, 3)
     hint = f"did you mean {' or '.join(near)}?" if near else "settings are named as on the command line of fit"
-    raise ConfigError(f"no run tells {name!r}, neither as a tag nor as a setting; {hint}")
+    raise ConfigError(f"no run has {name!r}, neither as a tag nor as a setting; {hint}")
 
 
-def read_date(text: str, end: bool = False) -> Date:
-    """An ISO date or time, of this machine's clock unless it names a zone.
+def read_date(text: str, end: bool = False) -> float:
+    """The milliseconds since 1970, as MLflow counts them, of an ISO date or time; local time unless it names a zone.
 
     Args:
         text: such as `2026-03-01` or `2026-03-01T18:00`.
@@ -117,35 +101,29 @@ def read_date(text: str, end: bool = False) -> Date:
         raise ConfigError(f"{text!r} is no date; give one as 2026-03-01 or 2026-03-01T18:00") from None
     whole_day = len(text) <= len("2026-03-01") and "T" not in text
     try:
-        return Date(text, (date + timedelta(days=1) if end and whole_day else date).astimezone().timestamp() * 1e3)
+        return (date + timedelta(days=1) if end and whole_day else date).astimezone().timestamp() * 1e3
     except (ValueError, OverflowError, OSError):  # which of them depends on the system
         raise ConfigError(f"{text!r} is out of range; give a date such as 2026-03-01") from None
 
 
-def _keep_values(runs: list[Run], option: str, wanted: Sequence[str], value: Callable[[Run], str | None]) -> list[Run]:
+def _keep_values(runs: list[Run], option: str, wanted: Sequence[str], read: Callable[[Run], str | None]) -> list[Run]:
     """The runs whose value is one of those wanted; all where nothing is."""
-    if not wanted:
-        return runs
-    values = {run.run_id: value(run) for run in runs}
-    there = sorted({told for told in values.values() if told is not None}, key=str)
-    for want in wanted:
-        if want not in there:
-            more = f" and {len(there) - MOST} more" if len(there) > MOST else ""
-            said = option + want if option.endswith("=") else f"{option} {want}"
-            raise ConfigError(f"{said} matches no run; there is {', '.join(there[:MOST]) or 'none'}{more}")
-    return [run for run in runs if values[run.run_id] in wanted]
+    values = sorted({value for run in runs if (value := read(run)) is not None})
+    for value in wanted:
+        if value not in values:
+            more = f" and {len(values) - MOST} more" if len(values) > MOST else ""
+            listed = ", ".join(values[:MOST]) or "none"
+            raise ConfigError(f"{option}{value} matches no run; there is {listed}{more}")
+    return [run for run in runs if read(run) in wanted] if wanted else runs
 
 
-def _keep_dates(runs: list[Run], filters: Filters) -> list[Run]:
-    low = filters.since.milliseconds if filters.since else float("-inf")
-    high = filters.until.milliseconds if filters.until else float("inf")
+def _keep_dates(runs: list[Run], since: str | None, until: str | None) -> list[Run]:
+    low = read_date(since) if since else float("-inf")
+    high = read_date(until, end=True) if until else float("inf")
     kept = [run for run in runs if low <= run.started < high]
     if not kept:
-        first, last = (
-            datetime.fromtimestamp(end(run.started for run in runs) / 1e3).isoformat(" ", "minutes")
-            for end in (min, max)
-        )
-        dates = {"--since": filters.since, "--until": filters.until}
-        told = " ".join(f"{option} {date.text}" for option, date in dates.items() if date)
-        raise ConfigError(f"{told} matches no run; the {len(runs)} others are from {first} to {last}")
+        ends = (end(run.started for run in runs) / 1e3 for end in (min, max))
+        first, last = (datetime.fromtimestamp(seconds).isoformat(" ", "minutes") for seconds in ends)
+        options = " ".join(f"{name} {date}" for name, date in (("--since", since), ("--until", until)) if date)
+        raise ConfigError(f"{options} matches no run; the {len(runs)} others are from {first} to {last}")
     return kept

@@ -1,8 +1,9 @@
 """Reference rows for the scenes on show: chosen, merged where tables agree, and marked as published.
 
-`published_rows.csv` has the errors, one a line: median error in metres and degrees on the official test split (`cell`),
-and means over the seven scenes that the field quotes, with the original ground truth (`mean`). Numbers are as
-printed, but for three kinds of slips that the chapters themselves show:
+`published_rows.csv` has the errors, one a line: medians in metres and degrees on the official test split (`cell`),
+and means over the seven scenes that the field quotes, with the original ground truth (`mean`). `published_scenes.csv`
+has the scenes, `published_remarks.csv` remarks by table, or by scene of tables 4.1 and 5.2. Numbers
+are as printed, but for three kinds of slips that the chapters themselves show:
 
 - Tables 2.3 and 3.2 name the scenes in another order than the later ones, yet seven of their rows from the literature
   are in the later order. These rows are read in that order.
@@ -17,14 +18,13 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cache
+from dataclasses import replace
 from importlib.resources import files
 
-from lightning_pose.reports.comparability import tested
-from lightning_pose.reports.table import Cell, Mean, Report, Row, add_means
+from lightning_pose.reports.comparability import find_tested_fact
+from lightning_pose.reports.table import Cell, Report, Row, add_means
 
-__all__ = ["CHAPTERS", "FRAMES", "SCENES", "Published", "add_published", "published_systems"]
+__all__ = ["CHAPTERS", "FRAMES", "SCENES", "add_published", "read_published"]
 
 CHAPTERS = (2, 3, 4, 5, 6)
 SOURCE = (
@@ -35,70 +35,35 @@ SEVEN = 7
 GROUND_TRUTHS = {"7scenes": "original", "cambridge": "sfm"}
 """What the published errors of a dataset were measured against."""
 
-SCENES = {
-    "chess": "chess",
-    "fire": "fire",
-    "heads": "heads",
-    "office": "office",
-    "pumpkin": "pumpkin",
-    "redkitchen": "kitchen",
-    "stairs": "stairs",
-    "kingscollege": "kings",
-    "stmaryschurch": "mary",
-    "shopfacade": "shop",
-}
-"""Names of the datasets' folders, in small letters without spaces, hyphens and underscores, to the names below."""
 
-FRAMES = {
-    "chess": 2000, "fire": 2000, "heads": 1000, "office": 4000, "pumpkin": 2000, "kitchen": 5000, "stairs": 1000,
-    "kings": 343, "mary": 530, "shop": 103,
-}  # fmt: skip
+def _read_csv(name: str) -> list[dict[str, str]]:
+    """The lines of a CSV file of this package, in their order."""
+    text = files("lightning_pose.reports").joinpath(f"{name}.csv").read_text(encoding="utf-8")
+    return list(csv.DictReader(text.splitlines()))
+
+
+SCENES = {line["folder"]: line["name"] for line in _read_csv("published_scenes")}
+"""Folders of the datasets, in small letters without spaces, hyphens and underscores, to names of scenes in the rows."""
+
+FRAMES = {line["name"]: int(line["test_frames"]) for line in _read_csv("published_scenes")}
 """Test frames of the official splits."""
 
-REMARKS = {
-    "2.3": "the rows PoseNet, Posenet-U, G-PoseNet, Pose-L, Pose-H, VidLoc and Mobile-PoseNet of table 2.3 are read "
-    "in the order of scenes of tables 4.1 and 5.2, which its heading does not have",
-    "3.2": "the rows PoseNet, Posenet-U, G-PoseNet, Pose-L and Mobile-PoseNet of table 3.2 likewise",
-    "4.1": "table 4.1 gives G-PoseNet the cells that table 5.2 gives LSTM. PN",
-    "shop": "table 4.1's shop cell of Node-Pose (ImageNet), 0.8/47, is taken for 0.8/4.7",
-    "mary": "in tables 4.1 and 5.2, most cells of St Mary's below the chapter's own systems repeat the shop's of the "
-    "row above: as printed, but not to be relied on",
-    "6.1": "the clips of table 6.1 have 2 to 400 frames, of scenes that were not trained on",
-}
-"""What a reader of a table must know, by table, or by scene of tables 4.1 and 5.2."""
 
-
-@dataclass(frozen=True)
-class Published:
-    """A row of a published table.
-
-    Attributes:
-        system: as the table names it.
-        table: number of the table.
-        task: `absolute`, or `relative` for poses within clips.
-        cells: by scene, in the names that `SCENES` gives.
-    """
-
-    system: str
-    table: str
-    task: str
-    cells: dict[str, Cell] = field(default_factory=dict)
-
-
-def published_systems(chapters: Iterable[int] = CHAPTERS) -> list[Published]:
+def read_published(chapters: Iterable[int] = CHAPTERS) -> dict[tuple[str, str, str], dict[str, Cell]]:
     """The rows of the thesis's tables 2.3, 3.2, 4.1, 5.2 and 6.1.
 
     Args:
         chapters: whose tables.
+
+    Returns:
+        (number of the table, system as the table names it, task) to cells by scene, in the names that `SCENES` gives.
     """
-    wanted = {str(chapter) for chapter in chapters}
-    systems: dict[tuple[str, str], Published] = {}
-    for line in _read_published_lines("cell"):
-        if line["chapter"] in wanted:
-            key = line["table"], line["system"]
-            published = systems.setdefault(key, Published(line["system"], line["table"], line["task"]))
-            published.cells[line["scene"]] = _published_cell(line)
-    return list(systems.values())
+    rows: dict[tuple[str, str, str], dict[str, Cell]] = {}
+    for line in _read_csv("published_rows"):
+        if line["kind"] == "cell" and int(line["chapter"]) in chapters:
+            row = rows.setdefault((line["table"], line["system"], line["task"]), {})
+            row[line["scene"]] = _published_cell(line)
+    return rows
 
 
 def add_published(report: Report, chapters: Sequence[int] = ()) -> None:
@@ -108,132 +73,105 @@ def add_published(report: Report, chapters: Sequence[int] = ()) -> None:
         report: gets rows, notes and footnotes.
         chapters: of the thesis; all, and means of other papers, if none is given.
     """
-    columns = {scene: name for scene in report.scenes if (name := _known(report, scene))}
+    columns = {scene: name for scene in report.scenes if (name := _published_name(report, scene))}
     if not columns:
         report.notes.append(
             f"no published row: none of the scenes on show ({', '.join(report.scenes)}) is one of 7-Scenes "
             f"or Cambridge with its original ground truth ({', '.join(SCENES)})"
         )
         return
-    rows: list[Row] = []
+    rows: dict[tuple[object, ...], Row] = {}
     tables: set[str] = set()
     left_out: set[str] = set()
-    for published in published_systems(chapters or CHAPTERS):
-        cells = {}
-        for scene, name in columns.items():
-            if name in published.cells:
-                if report.facts[scene].get("task", published.task) != published.task:
-                    left_out.add(published.task)
-                    continue
-                cells[scene] = published.cells[name]
-        if cells:
-            tables.add(published.table)
-            _merge(rows, published, cells)
-    add_means(report, rows)
-    means = _means(report, columns) if not chapters else []
-    report.rows += rows + means
+    for (table, system, task), cells in read_published(chapters or CHAPTERS).items():
+        shared = {scene: cells[name] for scene, name in columns.items() if name in cells}
+        alike = {scene: shared[scene] for scene in shared if report.facts[scene].get("task", task) == task}
+        if len(alike) < len(shared):
+            left_out.add(task)
+        if alike:
+            # Tables that agree in all the cells on show share a row.
+            key = system, *((scene, cell.errors) for scene, cell in alike.items())
+            row = rows.setdefault(key, Row("published", system, "", alike))
+            row.source += f", {table}" if row.source else f"table {table}"
+            row.features = row.source
+            tables.add(table)
+    add_means(report, list(rows.values()))
+    means = [] if chapters else _mean_rows(report, columns)
+    report.rows += [*rows.values(), *means]
     report.notes += [f"published rows of {task} poses are left out: those on show are not" for task in sorted(left_out)]
-    report.notes += [_comparable(report, columns)] if rows or means else ["no published row has the task on show"]
-    report.footnotes += _footnotes(sorted(tables), bool(means), set(columns.values()))
-
-
-@cache
-def _read_published_lines(kind: str) -> list[dict[str, str]]:
-    """The lines of the CSV file of a kind, `cell` or `mean`, in the order of the tables."""
-    text = files("lightning_pose.reports").joinpath("published_rows.csv").read_text(encoding="utf-8")
-    return [line for line in csv.DictReader(text.splitlines()) if line["kind"] == kind]
+    report.notes.append(_compare_scenes(report, columns) if rows or means else "no published row has the task on show")
+    report.footnotes += _list_sources(sorted(tables), bool(means), set(columns.values()))
 
 
 def _published_cell(line: Mapping[str, str]) -> Cell:
     """The errors of a line, as numbers and as printed; VidLoc has no orientation."""
-    position, orientation = line["position_m"], line["orientation_deg"]
-    return Cell(float(position), float(orientation) if orientation else None, text=(position, orientation))
+    text = line["position_m"], line["orientation_deg"]
+    return Cell((float(text[0]), float(text[1]) if text[1] else None), text=text)
 
 
-def _known(report: Report, scene: str) -> str | None:
+def _published_name(report: Report, scene: str) -> str | None:
     """The published name of a scene on show; that of the scene tested on, for a model trained elsewhere."""
     facts = report.facts[scene]
-    truth = GROUND_TRUTHS.get(tested(scene, facts, "dataset") or "7scenes")
-    if truth is None or (tested(scene, facts, "ground_truth") or truth) != truth:
+    truth = GROUND_TRUTHS.get(find_tested_fact(scene, facts, "dataset") or "7scenes")
+    if truth is None or (find_tested_fact(scene, facts, "ground_truth") or truth) != truth:
         return None
     return SCENES.get(re.sub("[ _-]", "", scene.rpartition(" to ")[2].lower()))
 
 
-def _merge(rows: list[Row], published: Published, cells: dict[str, Cell]) -> None:
-    """One row for tables that agree in all the cells on show."""
-    for row in rows:
-        if row.system == published.system and _values(row.cells) == _values(cells):
-            row.source += f", {published.table}"
-            row.features = row.source
-            return
-    source = f"table {published.table}"
-    rows.append(Row("published", published.system, source, cells, source=source))
-
-
-def _values(cells: dict[str, Cell]) -> dict[str, tuple[float, float | None]]:
-    return {scene: (cell.position_m, cell.orientation_deg) for scene, cell in cells.items()}
-
-
-def _means(report: Report, columns: dict[str, str]) -> list[Row]:
-    """Means over the seven scenes, which stand beside means over just these."""
+def _mean_rows(report: Report, columns: dict[str, str]) -> list[Row]:
+    """Means over the seven scenes as other papers quote them, where a column of the report is over just these."""
     absolute = {scene for scene in columns if report.facts[scene].get("task", "absolute") == "absolute"}
     seven = set(list(SCENES.values())[:SEVEN])
     for column, scenes in report.means.items():
         if len(scenes) == SEVEN and {columns[scene] for scene in scenes if scene in absolute} == seven:
-            return [_published_mean(column, line) for line in _read_published_lines("mean")]
+            rows = []
+            for line in [line for line in _read_csv("published_rows") if line["kind"] == "mean"]:
+                mean = replace(_published_cell(line), text=None, scenes=SEVEN)
+                source = line["source"]
+                rows.append(Row("published", line["system"], source, {}, means={column: mean}, source=source))
+            return rows
     if absolute:
         report.notes.append("published means over the seven scenes are left out: other scenes, or fewer, are on show")
     return []
 
 
-def _published_mean(column: str, line: Mapping[str, str]) -> Row:
-    cell = _published_cell(line)
-    mean = Mean(cell.position_m, cell.orientation_deg, SEVEN)
-    source = line["source"]
-    return Row("published", line["system"], source, {}, means={column: mean}, source=source)
-
-
-def _comparable(report: Report, columns: dict[str, str]) -> str:
-    """Whether the scenes on show are what was published."""
-    reasons = [why for scene, name in columns.items() for why in _differences(scene, name, report.facts[scene])]
+def _compare_scenes(report: Report, columns: dict[str, str]) -> str:
+    """A note on whether the scenes on show are what was published."""
+    reasons = [why for scene, name in columns.items() for why in _list_differences(scene, name, report.facts[scene])]
     if not reasons:
         return "published rows are of the same official test frames; image sizes and training may differ"
     return f"published rows are of the whole official test split and do not compare: {'; '.join(reasons)}"
 
 
-def _differences(scene: str, name: str, facts: Mapping[str, str]) -> list[str]:
+def _list_differences(scene: str, name: str, facts: Mapping[str, str]) -> list[str]:
     """What keeps the errors on a scene from comparing with published ones."""
     reasons = []
-    told, whole = facts.get("test_frames"), str(FRAMES[name])
-    # A scene that was only tested on gives the frames of its official split, and tells that it is unseen.
+    frames, whole = facts.get("test_frames"), str(FRAMES[name])
+    # A scene that was only tested on has the frames of its official split, and the split `unseen`.
     if facts.get("split", "official") not in ("official", "unseen"):
         reasons.append(f"{scene} has its own split ({facts['split']})")
-    elif told is None:
-        reasons.append(f"{scene} may be a cut, no run tells how many of the {whole} test frames it has")
-    elif told != whole:
-        reasons.append(f"{scene} is a cut, {told} test frames of {whole}")
-    if facts.get("task") == "relative" and _seen(scene, facts):
-        asked = scene.rpartition(" to ")[2]
+    elif frames is None:
+        reasons.append(f"{scene} may be a cut, no run records how many of the {whole} test frames it has")
+    elif frames != whole:
+        reasons.append(f"{scene} is a cut, {frames} test frames of {whole}")
+    # Where no run records the split, the names say what was trained on.
+    learned, apart, asked = scene.rpartition(" to ")
+    seen = facts["split"] != "unseen" if "split" in facts else not apart or asked in learned.split("+")
+    if facts.get("task") == "relative" and seen:
         reasons.append(f"{asked} was seen in training, the scenes of published clips were not")
     return reasons
 
 
-def _seen(scene: str, facts: Mapping[str, str]) -> bool:
-    """Whether the scene tested on was trained on, by the split or, where no run records that, by the names."""
-    if "split" in facts:
-        return facts["split"] != "unseen"
-    learned, apart, asked = scene.rpartition(" to ")
-    return not apart or asked in learned.split("+")
-
-
-def _footnotes(tables: Sequence[str], means: bool, scenes: set[str]) -> list[str]:
+def _list_sources(tables: Sequence[str], means: bool, scenes: set[str]) -> list[str]:
+    """The footnotes: sources, what must be known about them, and what they are not."""
     notes = []
     if tables:
         notes.append(
             f"{SOURCE}, table{'s' if len(tables) > 1 else ''} {', '.join(tables)}: cells as printed, means recomputed "
             "from them, so that the tables' own averages may differ; the chapters disagree with each other in places"
         )
-        notes += [remark for about, remark in REMARKS.items() if about in (*tables, *scenes)]
+        remarks = _read_csv("published_remarks")
+        notes += [line["remark"] for line in remarks if line["about"] in (*tables, *scenes)]
     if means:
         notes.append("means over the seven scenes, original ground truth, as the literature quotes them: no cells")
     if notes:

@@ -8,6 +8,7 @@ from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 from torch import Tensor
 
+from lightning_pose.data.datamodule import find_datamodule
 from lightning_pose.runs.logger import MLflowLogger
 
 __all__ = ["BestCheckpoint", "LastCheckpoint", "checkpoint_folder", "run_logger"]
@@ -26,7 +27,7 @@ def checkpoint_folder(trainer: Trainer) -> Path:
 
 
 class _RunCheckpoint(ModelCheckpoint):
-    """A checkpoint in the run's own folder, which is known only once the run has begun."""
+    """A checkpoint in the run's own folder, whose path is known only once the run has begun."""
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         if stage == "fit":
@@ -37,10 +38,10 @@ class _RunCheckpoint(ModelCheckpoint):
 class BestCheckpoint(_RunCheckpoint):
     """`best.ckpt`: the weights of the best epoch on validation frames, or of the last one where there are none.
 
-    The run keeps that epoch's validation metrics as `best/val/...`, beside `val/...` of every epoch.
+    That epoch's validation metrics are logged as `best/val/...`, beside `val/...` of every epoch.
 
     Args:
-        monitor: the validation metric that decides; lower is better.
+        monitor: the validation metric to choose by; lower is better.
     """
 
     def __init__(self, monitor: str = "val/loss") -> None:
@@ -48,7 +49,7 @@ class BestCheckpoint(_RunCheckpoint):
         self._metrics: dict[str, float] = {}
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        datamodule = getattr(trainer, "datamodule", None)
+        datamodule = find_datamodule(trainer)
         if stage == "fit" and datamodule is not None and not datamodule.val_dataloader():
             self.monitor = None
         super().setup(trainer, pl_module, stage)
@@ -56,32 +57,34 @@ class BestCheckpoint(_RunCheckpoint):
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         before = self.best_model_score
         super().on_validation_end(trainer, pl_module)
-        self._remember(trainer, before)
+        self._keep_metrics(trainer, before)
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         before = self.best_model_score
         super().on_train_epoch_end(trainer, pl_module)
-        self._remember(trainer, before)
+        self._keep_metrics(trainer, before)
 
-    def _remember(self, trainer: Trainer, before: Tensor | None) -> None:
+    def _keep_metrics(self, trainer: Trainer, before: Tensor | None) -> None:
+        """Keep the epoch's validation metrics if it is the best so far; `before` is the best score until now."""
         if self.best_model_score is not before:
             measured = trainer.callback_metrics.items()
             self._metrics = {f"best/{name}": float(v) for name, v in measured if name.startswith("val/")}
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._tell(trainer)
+        self._log_best(trainer)
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        self._tell(trainer)
+        self._log_best(trainer)
 
-    def _tell(self, trainer: Trainer) -> None:
+    def _log_best(self, trainer: Trainer) -> None:
+        """Log the best epoch's validation metrics."""
         logger = run_logger(trainer)
         if logger is not None and self._metrics:
             logger.log_metrics(self._metrics)
 
 
 class LastCheckpoint(_RunCheckpoint):
-    """`last.ckpt`: everything that training needs to go on, after every epoch."""
+    """`last.ckpt`: everything that training needs to resume, written after every epoch."""
 
     def __init__(self) -> None:
         # On the end of the training epoch, so that it is written with and without validation frames.

@@ -1,4 +1,4 @@
-"""The bar that training shows: one line, epochs done and to go, with the latest losses and validation errors.
+"""EpochBar: a progress bar over the epochs of training, with the latest losses and validation errors.
 
 Epochs here take a second or less, so that a bar over their batches would only flicker.
 """
@@ -6,12 +6,19 @@ Epochs here take a second or less, so that a bar over their batches would only f
 from __future__ import annotations
 
 import sys
-from typing import Any
 
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import ProgressBar
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 __all__ = ["EpochBar"]
 
@@ -19,12 +26,12 @@ SHOWN = {"train/loss": "loss", "val/position_median_m": "val m", "val/orientatio
 
 
 class EpochBar(ProgressBar):
-    """A bar over epochs, on the terminal's stderr; where there is no terminal, one line every tenth of the run."""
+    """A bar over epochs on a terminal's stderr; without a terminal, one line after each tenth of the run."""
 
     def __init__(self) -> None:
         super().__init__()
         self._bar: Progress | None = None
-        self._task: Any = None
+        self._task = TaskID(0)
         self._on = True
 
     def disable(self) -> None:

@@ -1,4 +1,4 @@
-"""Where runs are kept: an MLflow logger with the project's defaults, and the model that MLflow can load."""
+"""MLflowLogger: Lightning's MLflow logger with the project's defaults; runs to resume; the model that MLflow loads."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from lightning.fabric.utilities.rank_zero import rank_zero_only
 from lightning.pytorch.loggers import MLFlowLogger
@@ -24,29 +24,30 @@ from lightning_pose.runs.tags import PARENT_TAG
 if TYPE_CHECKING:
     from mlflow import MlflowClient
 
-__all__ = ["MLflowLogger", "flatten", "last_run", "log_localizer"]
+__all__ = ["MLflowLogger", "find_last_run", "flatten_settings", "log_localizer"]
 
 REQUIREMENTS = (
-    "torch",
-    "lightning",
-    "opencv-contrib-python-headless",
-    "numpy",
-    "scipy",
+    "jaxtyping",
     "jsonargparse",
-    "safetensors",
+    "lightning",
+    "numpy",
+    "opencv-contrib-python-headless",
     "platformdirs",
     "rich",
+    "safetensors",
+    "scipy",
+    "torch",
 )
-"""What a logged model needs beside this package, which it carries along."""
+"""Distributions that a logged model needs; this package itself is logged with it."""
 
 PACKAGE = Path(__file__).parents[1]
 
 
 class MLflowLogger(MLFlowLogger):
-    """Lightning's MLflow logger, with a database by default and honest endings.
+    """Lightning's MLflow logger, with a database by default, and a status that shows how the run ended.
 
-    A run that a user or a signal stops ends as KILLED and one that breaks as FAILED. A run whose process was killed
-    outright is found by the next run on the same machine, and marked KILLED then.
+    A run that a user or a signal stops ends as KILLED, and one that an error stops as FAILED. A run whose process was
+    killed outright is found by the next run on the same machine, and marked KILLED then.
 
     Args:
         experiment_name: MLflow experiment.
@@ -54,6 +55,11 @@ class MLflowLogger(MLFlowLogger):
         tracking_uri: MLflow store; `MLFLOW_TRACKING_URI`, else `sqlite:///mlruns/mlflow.db`.
         run_id: continue this run.
         root: folder of the default database and its artifacts.
+
+    Attributes:
+        uri: the tracking store's address.
+        run_name: the name that the user gave, if any.
+        stopped_as: the status of a run that Lightning reports as failed.
     """
 
     def __init__(
@@ -67,7 +73,7 @@ class MLflowLogger(MLFlowLogger):
         # alembic and mlflow announce each table of a new database on the terminal.
         for noisy in ("alembic", "mlflow.store.db.utils", "mlflow.tracking.fluent"):
             logging.getLogger(noisy).setLevel(logging.WARNING)
-        logging.getLogger("lightning.pytorch.loggers.mlflow").setLevel(logging.ERROR)  # a first experiment is no news
+        logging.getLogger("lightning.pytorch.loggers.mlflow").setLevel(logging.ERROR)  # of a new experiment
         uri = tracking_uri or default_tracking_uri(root)
         local = uri.startswith("sqlite:///")
         if local:
@@ -79,36 +85,36 @@ class MLflowLogger(MLFlowLogger):
             run_id=run_id,
             artifact_location=(Path(root) / "artifacts").resolve().as_uri() if local else None,
         )
+        self.uri = uri
+        self.run_name = run_name
         self.stopped_as = "FAILED"
+        self._opened = False
         self._claimed = False
 
     @property
     def experiment(self) -> MlflowClient:
-        """The MLflow client of the store, with the run created: Lightning's name of it."""
-        with _environment_kept():
-            return super().experiment
+        """The MLflow client of the store, with the run created; Lightning's code uses it by this name."""
+        with _keep_environment():
+            client = super().experiment
+        self._opened = True
+        return client
 
     @property
     def client(self) -> MlflowClient:
-        """The MLflow client of the store, with the run created, and this process its owner."""
+        """The MLflow client of the store, with the run created and this process recorded as its owner."""
         client = self.experiment
         if not self._claimed:
             self._claimed = True
-            # A run that goes on belongs to this process now; with the tags of the ended one it would be closed.
+            # A resumed run belongs to this process now; with the tags of the ended one it would be closed.
             for name, value in process_tags().items():
                 client.set_tag(str(self.run_id), name, value)
             self._close_stale_runs(client)
         return client
 
-    @property
-    def uri(self) -> str:
-        """The tracking store's address."""
-        return self._tracking_uri
-
     def _close_stale_runs(self, client: MlflowClient) -> None:
-        """Mark runs of this machine whose process is gone: nothing could mark them when it ended.
+        """Mark runs of this machine whose process no longer exists as KILLED.
 
-        A sweep's run names the process of the last command; it stays open while one of its trials runs.
+        A sweep's run has the tags of the last command's process; it stays open while one of its trials runs.
         """
         running = client.search_runs([str(self.experiment_id)], "attributes.status = 'RUNNING'")
         dead = [run for run in running if run.info.run_id != self.run_id and has_owner_died(run)]
@@ -118,28 +124,28 @@ class MLflowLogger(MLFlowLogger):
             client.set_terminated(run_id, "KILLED")
 
     @rank_zero_only
-    def log_hyperparams(self, params: Any) -> None:
+    def log_hyperparams(self, params: Mapping[str, object]) -> None:
         """Log what the run does not have yet: MLflow refuses to change a parameter, and a resumed run may."""
         known = self.client.get_run(str(self.run_id)).data.params
-        flat = flatten(params)
+        flat = flatten_settings(params)
         super().log_hyperparams({name: value for name, value in flat.items() if name not in known})
 
     @rank_zero_only
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
         """Log metrics; Ctrl-C takes effect once they are written."""
-        with _interrupts_delayed():
+        with _delay_interrupts():
             super().log_metrics(metrics, step)
 
     @rank_zero_only
     def finalize(self, status: str = "success") -> None:
-        """End the run: FINISHED, or `stopped_as` where Lightning says that it failed."""
-        if self._initialized:
+        """End the run as FINISHED, or as `stopped_as` if Lightning reports that it failed."""
+        if self._opened:
             self.client.set_terminated(str(self.run_id), self.stopped_as if status == "failed" else "FINISHED")
 
 
 @contextmanager
-def _interrupts_delayed() -> Iterator[None]:
-    """Ctrl-C within takes effect at the end.
+def _delay_interrupts() -> Iterator[None]:
+    """Delay Ctrl-C until the end of the block.
 
     A transaction that KeyboardInterrupt breaks off may keep SQLite locked for this process: the next write, which is
     to close the run, waits 20 s and fails with "database is locked".
@@ -158,8 +164,8 @@ def _interrupts_delayed() -> Iterator[None]:
 
 
 @contextmanager
-def _environment_kept() -> Iterator[None]:
-    """MLflow writes the address of its store into `MLFLOW_TRACKING_URI`, where the next logger would read it."""
+def _keep_environment() -> Iterator[None]:
+    """Restore `MLFLOW_TRACKING_URI` at the end: MLflow sets it to its store, and the next logger would read it."""
     before = os.environ.get(STORE_VARIABLE)
     try:
         yield
@@ -169,22 +175,22 @@ def _environment_kept() -> Iterator[None]:
             os.environ[STORE_VARIABLE] = before
 
 
-def flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def flatten_settings(config: Mapping[str, object], prefix: str = "") -> dict[str, object]:
     """Nested settings by dotted name; `init_args` is left out, so `model.units` and not `model.init_args.units`."""
-    flat: dict[str, Any] = {}
+    flat: dict[str, object] = {}
     for key, value in config.items():
         name = prefix if key == "init_args" else f"{prefix}.{key}" if prefix else str(key)
         if isinstance(value, Mapping):
-            flat |= flatten(value, name)
+            flat |= flatten_settings(value, name)
         else:
             flat[name] = value
     return flat
 
 
-def last_run(
-    uri: str, experiment_name: str, checkpoints: Path, architecture: str, data: Mapping[str, Any]
+def find_last_run(
+    uri: str, experiment_name: str, checkpoints: Path, architecture: str, data: Mapping[str, object]
 ) -> tuple[str, Path]:
-    """The newest run of an architecture on a scene that left a `last.ckpt`.
+    """Find the newest run of an architecture on a scene that left a `last.ckpt`.
 
     Args:
         uri: MLflow store.
@@ -210,22 +216,22 @@ def last_run(
         checkpoint = checkpoints / run.info.run_id / "last.ckpt"
         if checkpoint.is_file():
             return run.info.run_id, checkpoint
-    told = " ".join(f"data.{name}={value}" for name, value in data.items())
+    scene = " ".join(f"data.{name}={value}" for name, value in data.items())
     raise CheckpointError(
-        f"no run of {architecture} on {told} left a last.ckpt under {checkpoints}; leave --ckpt_path out to start one"
+        f"no run of {architecture} on {scene} left a last.ckpt under {checkpoints}; leave --ckpt_path out to start one"
     )
 
 
 def log_localizer(logger: MLflowLogger, checkpoint: Path) -> None:
-    """Keep a localizer in the run as `model`, for `mlflow.pyfunc.load_model`."""
+    """Log a localizer to the run as `model`, for `mlflow.pyfunc.load_model`."""
     import mlflow
 
     os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
-    # uv has no pip; a table is no type hint; and it tells of a lock file that it copies.
+    # Messages on pip, which uv lacks, on type hints of tables, and on a lock file that MLflow copies.
     for noisy in ("mlflow.utils.environment", "mlflow.models.signature", "mlflow.utils.uv_utils"):
         logging.getLogger(noisy).setLevel(logging.ERROR)
-    with _environment_kept(), warnings.catch_warnings():
-        # The model takes files, for which MLflow has no schema; it warns of that in its own way.
+    with _keep_environment(), warnings.catch_warnings():
+        # The model takes files, for which MLflow has no schema, and it warns of that.
         warnings.simplefilter("ignore", UserWarning)
         mlflow.set_tracking_uri(logger.uri)
         with mlflow.start_run(run_id=str(logger.run_id)):

@@ -16,21 +16,22 @@ from dataclasses import dataclass
 from functools import cached_property
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from lightning_pose.errors import ConfigError
+from lightning_pose.metrics.catalog import MEDIANS, SKILLS
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
+    from mlflow.store.entities import PagedList
 
-__all__ = ["Run", "masked", "read_runs", "runs_of_client"]
+__all__ = ["Run", "mask_passwords", "read_client_runs", "read_runs"]
 
+Item = TypeVar("Item")
 Query = Callable[[str], Iterable[Any]]
 
-VERBS = ("fit", "test")
-TABLES = ("experiments", "latest_metrics", "params", "runs", "tags")
 METRICS = re.compile(
-    r"(test|(best/)?val|baseline/\w+)/(position_median_m|orientation_median_deg)|(best/)?val/loss|test/skill_\w+|cost/\w+"
+    rf"(test|(best/)?val|baseline/\w+)/({'|'.join(MEDIANS)})|(best/)?val/loss|test/({'|'.join(SKILLS)})|cost/\w+"
 )
 """The metrics that a report reads; a run has a hundred others."""
 
@@ -39,18 +40,11 @@ ALIASES = {"seed_everything": "seed", "n_features": "data.extractor.n_features"}
 
 LARGEST = 1.7e308  # MLflow keeps infinity as the largest double
 
-_FINISHED = "r.status = 'FINISHED' AND r.lifecycle_stage = 'active' AND e.lifecycle_stage = 'active'"
-_MINE = f"""FROM runs r JOIN experiments e ON e.experiment_id = r.experiment_id
-JOIN tags v ON v.run_uuid = r.run_uuid AND v.key = 'verb' AND v.value IN ('fit', 'test')
-{{join}} WHERE {_FINISHED}"""
-_RUNS = f"SELECT r.run_uuid, r.name, e.name, r.start_time {_MINE.format(join='')}"
-_VALUES = "SELECT t.run_uuid, t.key, t.value " + _MINE.format(join="JOIN {table} t ON t.run_uuid = r.run_uuid")
-_METRICS = (
-    "SELECT t.run_uuid, t.key, t.value, t.is_nan "
-    + _MINE.format(join="JOIN latest_metrics t ON t.run_uuid = r.run_uuid")
-    + " AND (t.key LIKE 'test/%' OR t.key LIKE 'val/%' OR t.key LIKE 'best/val/%' OR t.key LIKE 'cost/%'"
-    + " OR t.key LIKE 'baseline/%_median_%')"
-)
+_FINISHED = """FROM runs r JOIN experiments e ON e.experiment_id = r.experiment_id
+JOIN tags v ON v.run_uuid = r.run_uuid AND v.key = 'verb' AND v.value IN ('fit', 'test') {join}
+WHERE r.status = 'FINISHED' AND r.lifecycle_stage = 'active' AND e.lifecycle_stage = 'active'"""
+_RUNS = f"SELECT r.run_uuid, r.name, e.name, r.start_time {_FINISHED.format(join='')}"
+_VALUES = "SELECT t.run_uuid, t.key, {columns} " + _FINISHED.format(join="JOIN {table} t ON t.run_uuid = r.run_uuid")
 _STATES = """SELECT v.value, r.status, r.lifecycle_stage FROM runs r
 LEFT JOIN tags v ON v.run_uuid = r.run_uuid AND v.key = 'verb'"""
 
@@ -79,18 +73,21 @@ class Run:
 
     @cached_property
     def settings(self) -> Mapping[str, str]:
-        """Tags and parameters by name, and what older runs did not say but follows from these."""
-        told = {**self.params, **{name: value for name, value in self.tags.items() if not name.startswith("mlflow.")}}
-        if "task" not in told and "data.class_path" in told:
-            told["task"] = "relative" if "data.clip_length" in told else "absolute"
-        if told.get("task") == "relative":
+        """Tags and parameters by name, and what older runs did not record but follows from these."""
+        settings = {
+            **self.params,
+            **{name: value for name, value in self.tags.items() if not name.startswith("mlflow.")},
+        }
+        if "task" not in settings and "data.class_path" in settings:
+            settings["task"] = "relative" if "data.clip_length" in settings else "absolute"
+        if settings.get("task") == "relative":
             for name in ("clip_length", "stride", "relative_frame"):
-                if f"data.{name}" in told:
-                    told.setdefault(name, told[f"data.{name}"])
+                if f"data.{name}" in settings:
+                    settings.setdefault(name, settings[f"data.{name}"])
         for alias, name in ALIASES.items():
-            if name in told:
-                told.setdefault(alias, told[name])
-        return told
+            if name in settings:
+                settings.setdefault(alias, settings[name])
+        return settings
 
     @property
     def system(self) -> str:
@@ -124,124 +121,97 @@ def read_runs(uri: str) -> list[Run]:
     Raises:
         ConfigError: there is no such store, it cannot be read, it is not MLflow's, or it has no such run.
     """
+    address, states = mask_passwords(uri), ""
     if uri.startswith(("http://", "https://")):
-        runs = _from_server(uri)
+        runs = _read_server(uri)
     elif re.match(r"\w+(\+\w+)?://", uri) and not uri.startswith("file:"):
-        with _open(uri) as query:
-            _check_tables(query, uri)
-            runs = _from_tables(query)
-            if not runs:
-                raise ConfigError(_nothing(query, uri))
+        with _open_database(uri) as query:
+            runs = _read_tables(query)
+            states = "" if runs else f" (runs: {_count_states(query)})"
     else:
         raise ConfigError(
-            f"the tracking store {masked(uri)} is no database and no server; give --tracking_uri sqlite:///FILE, "
+            f"the tracking store {address} is no database and no server; give --tracking_uri sqlite:///FILE, "
             "another database's URL, or the http address of an MLflow server"
         )
     if not runs:
         raise ConfigError(
-            f"{masked(uri)} has no finished run of fit or test; train with `python -m lightning_pose fit`"
+            f"{address} has no finished run of fit or test{states}; "
+            "train with `python -m lightning_pose fit --config configs/quickstart.yaml`"
         )
     return sorted(runs, key=lambda run: (run.started, run.run_id), reverse=True)
 
 
-def masked(text: str) -> str:
+def mask_passwords(text: str) -> str:
     """A store's address, or a text with addresses in it, without passwords."""
     return re.sub(r"(://[^:/@\s]*):\S*@", r"\1:***@", text)
 
 
 @contextmanager
-def _open(uri: str) -> Iterator[Query]:
-    """A function that runs one SQL query."""
-    if uri.startswith("sqlite:"):
-        with _open_sqlite(uri) as query:
-            yield query
-        return
-    # Half a second to import; MLflow brings it.
-    from sqlalchemy import create_engine, text
-    from sqlalchemy.exc import SQLAlchemyError
-
+def _open_database(uri: str) -> Iterator[Query]:
+    """A function that runs one SQL query; what the database refuses is raised as a `ConfigError`."""
+    address = mask_passwords(uri)
+    errors: tuple[type[Exception], ...] = (sqlite3.Error, ImportError)
     try:
-        engine = create_engine(_with_driver(uri))
-        with engine.connect() as connection:
-            yield lambda sql: connection.execute(text(sql)).fetchall()
-    except (SQLAlchemyError, ImportError) as error:
-        reason = " ".join(str(getattr(error, "orig", None) or error).split())
-        raise ConfigError(f"{masked(uri)} cannot be read ({masked(reason)}); check --tracking_uri") from error
+        if uri.startswith("sqlite:"):
+            file = Path(uri.removeprefix("sqlite:///").partition("?")[0])
+            if not uri.startswith("sqlite:///") or not file.is_file():
+                raise ConfigError(
+                    f"{address} does not exist; train with `python -m lightning_pose fit`, or say where the runs are "
+                    "with --tracking_uri sqlite:///FILE or MLFLOW_TRACKING_URI"
+                )
+            # Read-only, so that nothing is made or changed; a run that is writing is waited for.
+            with closing(sqlite3.connect(f"{file.resolve().as_uri()}?mode=ro", uri=True, timeout=30)) as connection:
+                connection.execute("BEGIN")
+                yield connection.execute
+        else:
+            # Half a second to import; MLflow brings it.
+            from sqlalchemy import create_engine, text
+            from sqlalchemy.exc import SQLAlchemyError
 
-
-def _with_driver(uri: str) -> str:
-    """PostgreSQL's URL with the driver that is installed."""
-    bare = re.match(r"postgres(ql)?://", uri)
-    if bare and find_spec("psycopg2") is None:
-        return "postgresql+psycopg://" + uri[bare.end() :]
-    return uri
-
-
-@contextmanager
-def _open_sqlite(uri: str) -> Iterator[Query]:
-    file = Path(uri.removeprefix("sqlite:///").partition("?")[0])
-    if not uri.startswith("sqlite:///") or not file.is_file():
+            errors = (*errors, SQLAlchemyError)
+            bare = re.match(r"postgres(ql)?://", uri)
+            driven = f"postgresql+psycopg://{uri[bare.end() :]}" if bare and find_spec("psycopg2") is None else uri
+            with create_engine(driven).connect() as connection:
+                yield lambda sql: connection.execute(text(sql)).fetchall()
+    except errors as error:
+        reason = mask_passwords(" ".join(str(getattr(error, "orig", None) or error).split()))
         raise ConfigError(
-            f"{masked(uri)} does not exist; train with `python -m lightning_pose fit`, or say where the runs are with "
-            "--tracking_uri sqlite:///FILE or MLFLOW_TRACKING_URI"
-        )
-    try:
-        # Read-only, so that nothing is made or changed; a run that is writing is waited for.
-        with closing(sqlite3.connect(f"{file.resolve().as_uri()}?mode=ro", uri=True, timeout=30)) as connection:
-            connection.execute("BEGIN")
-            yield connection.execute
-    except sqlite3.Error as error:
-        raise ConfigError(
-            f"{masked(uri)} cannot be read ({error}); give an MLflow database in --tracking_uri"
+            f"{address} cannot be read as an MLflow database ({reason}); check --tracking_uri: it "
+            "takes the one that MLflow writes, such as sqlite:///mlruns/mlflow.db"
         ) from error
 
 
-def _check_tables(query: Query, uri: str) -> None:
-    for table in TABLES:
-        try:
-            query(f"SELECT 1 FROM {table} WHERE 1 = 0")
-        except Exception as error:
-            if "locked" in str(error):
-                raise
-            raise ConfigError(
-                f"{masked(uri)} is not an MLflow database: it has no table `{table}`; give the one that MLflow "
-                "writes, such as --tracking_uri sqlite:///mlruns/mlflow.db"
-            ) from error
-
-
-def _from_tables(query: Query) -> list[Run]:
-    runs = list(query(_RUNS))  # before their values: what ends in between is not half read
-    values: dict[str, dict[str, dict[str, Any]]] = {}
-    for table in ("tags", "params"):
-        found = values.setdefault(table, {})
-        for run, name, value in query(_VALUES.format(table=table)):
-            found.setdefault(run, {})[name] = value
-    metrics = values.setdefault("metrics", {})
-    for run, name, value, is_nan in query(_METRICS):
+def _read_tables(query: Query) -> list[Run]:
+    runs = list(query(_RUNS))  # before their values, so that a run that ends in between is not read in part
+    tags: dict[str, dict[str, str]] = {}
+    params: dict[str, dict[str, str]] = {}
+    metrics: dict[str, dict[str, float]] = {}
+    for table, values in (("tags", tags), ("params", params)):
+        for run, name, value in query(_VALUES.format(table=table, columns="t.value")):
+            values.setdefault(run, {})[name] = value
+    for run, name, value, is_nan in query(_VALUES.format(table="latest_metrics", columns="t.value, t.is_nan")):
         if METRICS.fullmatch(name):
-            metrics.setdefault(run, {})[name] = math.nan if is_nan else _finite(value)
+            metrics.setdefault(run, {})[name] = math.nan if is_nan else _restore_infinity(value)
     return [
-        Run(run, name or "", experiment, started or 0, *(values[part].get(run, {}) for part in values))
+        Run(run, name or "", experiment, started or 0, tags[run], params.get(run, {}), metrics.get(run, {}))
         for run, name, experiment, started in runs
     ]
 
 
-def _finite(value: float) -> float:
+def _restore_infinity(value: float) -> float:
+    """The value as it was logged; MLflow keeps infinity as the largest double."""
     return math.copysign(math.inf, value) if abs(value) > LARGEST else float(value)
 
 
-def _nothing(query: Query, uri: str) -> str:
-    """Why a store has no run to show."""
-    rows = query(_STATES)
-    told = Counter(f"{verb or 'other'} {'deleted' if stage == 'deleted' else status}" for verb, status, stage in rows)
-    has = ", ".join(f"{count} {what}" for what, count in told.most_common()) or "none at all"
-    return (
-        f"{masked(uri)} has no finished run of fit or test (runs: {has}); "
-        "train with `python -m lightning_pose fit --config configs/quickstart.yaml`"
+def _count_states(query: Query) -> str:
+    """How many runs the store has of each verb and status, the most frequent first."""
+    states = Counter(
+        f"{verb or 'other'} {'deleted' if stage == 'deleted' else status}" for verb, status, stage in query(_STATES)
     )
+    return ", ".join(f"{count} {state}" for state, count in states.most_common()) or "none at all"
 
 
-def _from_server(uri: str) -> list[Run]:
+def _read_server(uri: str) -> list[Run]:
     """Ask a tracking server, through MLflow's client, which takes seconds to import."""
     from mlflow import MlflowClient
     from mlflow.exceptions import MlflowException
@@ -249,39 +219,36 @@ def _from_server(uri: str) -> list[Run]:
     # MLflow's own seven retries keep the user waiting for minutes where no server is.
     os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "2")
     try:
-        return runs_of_client(MlflowClient(uri))
+        return read_client_runs(MlflowClient(uri))
     except MlflowException as error:
-        reason = str(error).partition("\n")[0]
-        raise ConfigError(f"{masked(uri)} does not answer ({masked(reason)}); check --tracking_uri") from error
+        address, reason = mask_passwords(uri), mask_passwords(str(error).partition("\n")[0])
+        raise ConfigError(f"{address} does not answer ({reason}); check --tracking_uri") from error
 
 
-def runs_of_client(client: MlflowClient, page: int = 1000) -> list[Run]:
+def read_client_runs(client: MlflowClient, page: int = 1000) -> list[Run]:
     """As `read_runs`, page by page, unsorted."""
-    experiments = {e.experiment_id: e.name for e in _pages(lambda token: client.search_experiments(page_token=token))}
-    if not experiments:
-        return []
+    names = {e.experiment_id: e.name for e in _read_pages(lambda token: client.search_experiments(page_token=token))}
     query = "attributes.status = 'FINISHED'"
-    found = _pages(lambda token: client.search_runs(list(experiments), query, max_results=page, page_token=token))
+    found = _read_pages(lambda token: client.search_runs(list(names), query, max_results=page, page_token=token))
     return [
         Run(
             run.info.run_id,
             run.info.run_name or "",
-            experiments[run.info.experiment_id],
+            names[run.info.experiment_id],
             run.info.start_time or 0,
             run.data.tags,
             run.data.params,
-            {name: _finite(value) for name, value in run.data.metrics.items() if METRICS.fullmatch(name)},
+            {name: _restore_infinity(value) for name, value in run.data.metrics.items() if METRICS.fullmatch(name)},
         )
-        for run in found
-        if run.data.tags.get("verb") in VERBS
+        for run in (found if names else ())
+        if run.data.tags.get("verb") in ("fit", "test")
     ]
 
 
-def _pages(ask: Callable[[str | None], Any]) -> Iterator[Any]:
+def _read_pages(ask: Callable[[str | None], PagedList[Item]]) -> Iterator[Item]:
+    """All items of an answer that comes in pages, which are asked for by their token."""
     token = None
-    while True:
+    while token != "":
         answer = ask(token)
         yield from answer
-        token = answer.token
-        if not token:
-            return
+        token = answer.token or ""

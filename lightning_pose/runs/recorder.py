@@ -1,26 +1,28 @@
-"""What happens around training: checkpoints in the run's folder, the run's record, and its status."""
+"""RunRecorder: writes a run's name, tags, parameters, config, checkpoints and status to MLflow."""
 
 from __future__ import annotations
 
 import contextlib
 import os
 import subprocess
-from typing import Any
 
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback, Timer
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
+from lightning_pose.data.datamodule import SceneDataModule, scene_datamodule
 from lightning_pose.errors import ImageError
+from lightning_pose.models.base import PoseModule
 from lightning_pose.runs.checkpoints import checkpoint_folder, run_logger
 from lightning_pose.runs.logger import MLflowLogger
+from lightning_pose.runs.tags import OPERATIONAL
 from lightning_pose.scenes.images import read_gray
 
-__all__ = ["RunRecorder", "train_seconds"]
+__all__ = ["RunRecorder", "read_train_seconds"]
 
 
 class RunRecorder(Callback):
-    """Gives the run its name, tags, parameters and config, and ends it with the right status.
+    """Writes the run's name, tags, parameters, config and checkpoints, and its status if it is stopped.
 
     Attributes:
         config_yaml: the command line's whole configuration, kept in the run as `config.yaml`; None for none.
@@ -34,33 +36,36 @@ class RunRecorder(Callback):
         logger = run_logger(trainer)
         if logger is None:
             return
+        assert isinstance(pl_module, PoseModule)
         run_id = str(logger.run_id)
-        logger.client.update_run(run_id, status="RUNNING", name=self._name(trainer, pl_module, logger, stage))
+        logger.client.update_run(run_id, status="RUNNING", name=self._make_name(trainer, pl_module, logger, stage))
         if stage == "test" and logger.client.get_run(run_id).data.params:
             return  # the test that follows fit belongs to the same run
-        for name, value in self._tags(trainer, pl_module, stage).items():
+        for name, value in self._collect_tags(trainer, pl_module, stage).items():
             logger.client.set_tag(run_id, name, value)
-        logger.log_hyperparams(_settings(trainer, pl_module))
+        logger.log_hyperparams(_collect_settings(trainer, pl_module))
         if self.config_yaml is not None:
             logger.client.log_text(run_id, self.config_yaml, "config.yaml")
 
-    def _name(self, trainer: Trainer, module: LightningModule, logger: MLflowLogger, stage: str) -> str | None:
+    def _make_name(self, trainer: Trainer, module: PoseModule, logger: MLflowLogger, stage: str) -> str | None:
+        """The name of a new run; None for one that is resumed, which keeps its name."""
         kept = logger.client.get_run(str(logger.run_id)).data
         if kept.params:
-            return None  # a run that goes on keeps its name
-        scene, seed = trainer.datamodule.scene.name, _seed()  # type: ignore[attr-defined]
+            return None
+        scene, seed = scene_datamodule(trainer).scene.name, _read_seed()
         trial = kept.tags.get("sweep.trial")
         parts = (
             f"{type(module).__name__} {scene} {module.headline}",
             f"seed={seed}" if seed else "",
             "" if stage == "fit" else "(test)",
         )
-        name = logger._run_name or " ".join(part for part in parts if part)
+        name = logger.run_name or " ".join(part for part in parts if part)
         return name if trial is None else f"{name} trial {trial}"
 
     @staticmethod
-    def _tags(trainer: Trainer, module: LightningModule, stage: str) -> dict[str, str]:
-        datamodule = trainer.datamodule  # type: ignore[attr-defined]
+    def _collect_tags(trainer: Trainer, module: PoseModule, stage: str) -> dict[str, str]:
+        """The run's tags, by name."""
+        datamodule = scene_datamodule(trainer)
         scene = datamodule.scene
         tags = {
             "verb": str(getattr(stage, "value", stage)),  # Lightning gives an enum
@@ -74,7 +79,7 @@ class RunRecorder(Callback):
             "features": datamodule.extractor.name,
             **_test_tags(datamodule, module),
         }
-        commit = _git_commit()
+        commit = _read_git_commit()
         return tags | ({"git_commit": commit} if commit else {})
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
@@ -89,39 +94,35 @@ class RunRecorder(Callback):
                 logger.client.log_artifact(str(logger.run_id), str(file), "checkpoints")
 
 
-def train_seconds(trainer: Trainer) -> float | None:
+def read_train_seconds(trainer: Trainer) -> float | None:
     """Seconds spent in training, resumed parts included; None where nothing was trained."""
     timers = [callback for callback in trainer.callbacks if isinstance(callback, Timer)]  # type: ignore[attr-defined]
     return (timers[0].time_elapsed("train") or None) if timers else None
 
 
-_OF_THE_MACHINE = ("cache_dir", "workers", "eval_batch_size")
-"""Settings of the data that change nothing in the result, and would only differ where runs are compared."""
-
-
-def _settings(trainer: Trainer, module: LightningModule) -> dict[str, Any]:
-    datamodule = trainer.datamodule  # type: ignore[attr-defined]
+def _collect_settings(trainer: Trainer, module: PoseModule) -> dict[str, object]:
+    """The run's settings, nested, as parameters of the run: `MLflowLogger` flattens them."""
+    datamodule = scene_datamodule(trainer)
     data = datamodule.describe()
-    kept = {name: value for name, value in data["init_args"].items() if name not in _OF_THE_MACHINE}
+    kept = {name: value for name, value in data["init_args"].items() if name not in OPERATIONAL}
     return {
         # The name for the class path, which `config.yaml` has: MLflow's plots cut values off after some ten letters.
         "architecture": type(module).__name__,
         "scene": datamodule.scene.name,
         "features": datamodule.extractor.name,
-        "model": module.describe()["init_args"],  # type: ignore[operator]
+        "model": module.describe()["init_args"],
         "data": data | {"init_args": kept},
         "trainer": {"max_epochs": trainer.max_epochs, "precision": trainer.precision},
-        "seed": _seed(),
+        "seed": _read_seed(),
     }
 
 
-def _test_tags(datamodule: Any, module: LightningModule) -> dict[str, str]:
-    """What test errors are of: reports refuse to put errors of different things side by side."""
+def _test_tags(datamodule: SceneDataModule, module: PoseModule) -> dict[str, str]:
+    """Tags of what test errors are measured on; reports refuse to put runs with different ones into one column."""
     scene = datamodule.scene
-    test = scene.splits.get("test", ())
-    clips = getattr(module, "reads_clips", False)
-    tags = {"task": "relative" if clips else "absolute", "test_frames": str(len(test))}
-    if clips:
+    test = scene.splits.get("test", [])
+    tags = {"task": "relative" if module.reads_clips else "absolute", "test_frames": str(len(test))}
+    if module.reads_clips:
         tags |= {name: str(getattr(datamodule, name)) for name in ("clip_length", "stride", "relative_frame")}
     if len(test):
         # Of one frame: those of a scene are alike. Cached features do without images, so one may be gone.
@@ -131,12 +132,14 @@ def _test_tags(datamodule: Any, module: LightningModule) -> dict[str, str]:
     return tags
 
 
-def _seed() -> int | None:
+def _read_seed() -> int | None:
+    """The seed that Lightning has set for this process."""
     seed = os.environ.get("PL_GLOBAL_SEED")
     return int(seed) if seed else None
 
 
-def _git_commit() -> str | None:
+def _read_git_commit() -> str | None:
+    """The commit of the current folder's checkout; None if it is not one."""
     try:
         answer = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, timeout=10)
     except (OSError, subprocess.TimeoutExpired):

@@ -1,12 +1,15 @@
-"""Names under which runs and trials keep what later code looks up."""
+"""Names of the tags of MLflow runs and the user attributes of Optuna trials that the project writes and reads."""
 
-__all__ = ["CURVES", "METRICS", "NOTE", "PARENT_TAG", "PROCESS", "REASON", "RUN"]
+__all__ = ["CURVES", "METRICS", "NOTE", "OPERATIONAL", "PARENT_TAG", "PROCESS", "REASON", "RUN"]
 
 PARENT_TAG = "mlflow.parentRunId"
 """Tag of an MLflow run: the id of the run that it is nested in."""
 
 NOTE = "mlflow.note.content"
 """Tag that MLflow shows as a run's description, in Markdown."""
+
+OPERATIONAL = ("cache_dir", "workers", "eval_batch_size")
+"""Settings of the data that no result depends on: a run does not record them, and a report does not compare them."""
 
 PROCESS = "process"
 """User attribute of an Optuna trial: the process that runs it."""

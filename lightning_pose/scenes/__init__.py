@@ -1,1 +1,1 @@
-"""A folder on disk as a `Scene`: frames, poses and splits. `formats` reads, `synthetic` renders."""
+"""Folders of posed images as a `Scene` of frames and splits: `formats` reads them, `synthetic` renders one."""

@@ -1,4 +1,4 @@
-"""Image files to 8-bit arrays: one way of reading, with errors that name the file and the remedy."""
+"""Reads image files into 8-bit arrays, with errors that name the file and the remedy."""
 
 from __future__ import annotations
 
@@ -13,9 +13,11 @@ from lightning_pose.errors import ImageError
 __all__ = ["decode_image", "read_bytes", "read_gray", "read_rgb", "to_gray"]
 
 if "OPENCV_LOG_LEVEL" not in os.environ:
-    cv2.utils.logging.setLogLevel(1)  # fatal only: what OpenCV would print about a bad file, ImageError says once
+    cv2.utils.logging.setLogLevel(
+        1
+    )  # fatal only: OpenCV prints warnings about bad files that ImageError reports as well
 
-# Poses and intrinsics of a dataset refer to the pixels as stored, so EXIF never turns an image.
+# Poses and intrinsics of a dataset refer to the pixels as stored, so EXIF orientation is ignored.
 _FLAGS = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 
 
@@ -40,7 +42,7 @@ def read_rgb(path: Path | str) -> np.ndarray:
 
 
 def read_bytes(path: Path | str) -> bytes:
-    """The encoded file as it is on disk.
+    """Read an encoded image file.
 
     Raises:
         ImageError: the file is missing, a folder, empty, or may not be read.
@@ -81,13 +83,13 @@ def decode_image(data: bytes, path: Path | str, color: bool) -> np.ndarray:
     if image.dtype not in (np.uint8, np.uint16):
         raise ImageError(f"{path} holds {image.dtype} pixels; convert it to 8 or 16 bits a channel")
     image = _to_uint8(image)
-    # Each decoder weighs colour a little differently when asked for gray; this way a file, and the same
-    # pixels in memory, give the same gray.
+    # Decoders of different formats weight colours differently when asked for gray. Converted here, a file and the same
+    # pixels in memory give the same gray.
     return image if color else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
 
 
 def to_gray(image: np.ndarray) -> np.ndarray:
-    """Turn an array that a user holds into (H, W) uint8 gray.
+    """Convert an image array of a user into (H, W) uint8 gray.
 
     Args:
         image: (H, W), (H, W, 1), (H, W, 3) RGB or (H, W, 4) RGBA (alpha is dropped); uint8, uint16 over its
@@ -111,6 +113,7 @@ def to_gray(image: np.ndarray) -> np.ndarray:
 
 
 def _to_uint8(image: np.ndarray) -> np.ndarray:
+    """Convert uint16 by its upper 8 bits, and floats in 0..1 by rounding; uint8 is returned as it is."""
     if image.dtype == np.uint16:
         return (image >> 8).astype(np.uint8)
     if image.dtype == np.uint8:

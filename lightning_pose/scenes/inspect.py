@@ -1,45 +1,47 @@
-"""What is wrong with a dataset: images that cannot be read, poses that leap, splits that overlap."""
+"""Facts about a dataset, and its faults: unreadable images, copies across splits, poses that jump."""
 
 from __future__ import annotations
 
 import hashlib
 from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 
 from lightning_pose.errors import ImageError
 from lightning_pose.scenes.images import decode_image, read_bytes
-from lightning_pose.scenes.scene import Scene
+from lightning_pose.scenes.scene import SPLITS, Scene
 
 __all__ = [
     "Findings",
     "ImageFile",
-    "find_angle_deg",
-    "format_counts",
+    "SequenceFacts",
+    "count_sequence_frames",
+    "describe_scene",
     "inspect_images",
     "inspect_poses",
-    "map_frames_to_splits",
-    "measure_steps",
-    "read_image_file",
-    "stack_positions",
-    "stack_quats",
+    "read_image_files",
 ]
 
 JUMP = 20.0
-"""A step this many times the median is a jump; hand-held real sequences stay below five times."""
+"""A step longer than this many times the median is a jump; in real hand-held sequences none exceeds five times."""
 
 JUMP_DEG = 30.0
-"""A turn must reach this many degrees, and JUMP times the median, to count as a jump."""
+"""A rotation is a jump if it reaches this many degrees and JUMP times the median."""
 
 SHOWN = 5
-"""Findings of one kind that are printed one by one."""
+"""How many findings of one kind are listed one by one; of the others only the number is given."""
 
 
 @dataclass(frozen=True)
 class Findings:
-    """What is wrong: errors spoil a training or its numbers, warnings may be meant."""
+    """What is wrong with a dataset: errors make training or its results useless, warnings may be intended."""
 
     errors: list[str]
     warnings: list[str]
@@ -47,32 +49,97 @@ class Findings:
 
 @dataclass(frozen=True)
 class ImageFile:
-    """One image as it lies on disk: its size if it can be decoded, otherwise what is wrong with it."""
+    """An image file: digest of its bytes and `WIDTHxHEIGHT` if it can be decoded, otherwise what is wrong with it."""
 
     digest: bytes = b""
     size: str = ""
     error: str = ""
 
 
+class SequenceFacts(NamedTuple):
+    """One sequence: its name, how many of its frames each split has, and the numbers of its first and last frame."""
+
+    name: str
+    counts: dict[str, int]
+    first: int
+    last: int
+
+
+def read_image_files(scene: Scene) -> Iterator[ImageFile]:
+    """Read the image of each frame, in the order of the frames, with several threads.
+
+    Decoding and hashing release the interpreter's lock, so that threads are enough.
+    """
+    with ThreadPoolExecutor() as pool:
+        yield from pool.map(_read_image_file, [frame.image for frame in scene.frames])
+
+
+def describe_scene(scene: Scene, files: list[ImageFile]) -> dict[str, str]:
+    """Facts about a scene by their names, both in words: format, splits, image sizes, camera, extent, motion.
+
+    Args:
+        scene: the dataset, of at least one frame.
+        files: the image file of each of its frames.
+    """
+    sizes = {split: len(scene.splits[split]) for split in SPLITS}
+    camera = scene.frames[0].intrinsics
+    positions, quats = _stack_positions(scene), _stack_quats(scene)
+    facts = {
+        "format": f"{scene.format}, ground truth {scene.ground_truth}",
+        f"split ({scene.split_source})": ", ".join(f"{split} {size}" for split, size in sizes.items()),
+        "image size": _format_counts(Counter(file.size for file in files if file.size)) or "none can be read",
+        "intrinsics": "unknown" if camera is None else f"f {camera.fx:g} {camera.fy:g}, c {camera.cx:g} {camera.cy:g}",
+        "extent": " x ".join(f"{side:.2f}" for side in np.ptp(positions, axis=0)) + f" {scene.unit}",
+    }
+    step, angle_deg, _ = _measure_steps(scene)
+    if len(step):
+        facts["frame spacing"] = f"median {np.median(step):.3g} {scene.unit}, {np.median(angle_deg):.3g} deg"
+    from_mean = _find_angle_deg(Rotation.from_quat(quats, scalar_first=True).mean().as_quat(scalar_first=True), quats)
+    facts["rotation"] = f"up to {from_mean.max():.0f} deg from the mean, median {np.median(from_mean):.0f} deg"
+    train, test = scene.splits["train"], scene.splits["test"]
+    if len(train) and len(test):
+        distance, nearest = KDTree(positions[train]).query(positions[test])
+        angle_deg = _find_angle_deg(quats[test], quats[train[nearest]])
+        facts["test to nearest training pose"] = (
+            f"median {np.median(distance):.3g} {scene.unit}, {np.median(angle_deg):.3g} deg; "
+            f"up to {distance.max():.3g} {scene.unit}"
+        )
+    return facts
+
+
+def count_sequence_frames(scene: Scene) -> list[SequenceFacts]:
+    """Count the frames of each sequence, split by split; sequences are in the scene's order."""
+    split_of = _map_frames_to_splits(scene)
+    members: dict[str, list[int]] = {}
+    for i, frame in enumerate(scene.frames):
+        members.setdefault(frame.sequence, []).append(i)
+    facts = []
+    for name, rows in members.items():
+        counts = Counter(split_of[i] for i in rows)
+        first, last = scene.frames[rows[0]].index, scene.frames[rows[-1]].index
+        facts.append(SequenceFacts(name, {split: counts[split] for split in SPLITS}, first, last))
+    return facts
+
+
 def inspect_images(scene: Scene, files: list[ImageFile]) -> Findings:
-    """Unreadable images, copies of one image, above all between test and training, and mixed sizes.
+    """Find unreadable images, copies of one image (above all in test and training alike), and mixed sizes.
 
     Args:
         scene: the dataset.
-        files: what lies on disk for each of its frames.
+        files: the image file of each of its frames.
     """
     errors = [file.error for file in files if file.error]
     first: dict[bytes, int] = {}
     copies = [(i, first.setdefault(file.digest, i)) for i, file in enumerate(files) if file.digest]
     copies = [(i, original) for i, original in copies if i != original]
-    split_of = map_frames_to_splits(scene)
+    split_of = _map_frames_to_splits(scene)
     leaks = [(i, j) for i, j in copies if (split_of[i] == "test") != (split_of[j] == "test")]
     warnings = []
     for pairs, complaint in (
-        (copies, "images are copies of others (a camera that repeats frames does that)"),
+        (copies, "images are copies of others (some cameras repeat frames)"),
         (
             leaks,
-            "test images are also training or validation images, which flatters the result",
+            "test images are also training or validation images, which makes errors look smaller than they are",
         ),
     ):
         if pairs:
@@ -80,16 +147,16 @@ def inspect_images(scene: Scene, files: list[ImageFile]) -> Findings:
             warnings.append(f"{len(pairs)} {complaint}: {scene.frames[i].image} is {scene.frames[j].image}")
     sizes = Counter(file.size for file in files if file.size)
     if len(sizes) > 1:
-        warnings.append(f"images of {len(sizes)} sizes, {format_counts(sizes)}; resize them unless the cameras differ")
-    return Findings(limit_findings(errors, "unreadable images"), warnings)
+        warnings.append(f"images of {len(sizes)} sizes, {_format_counts(sizes)}; resize them unless the cameras differ")
+    return Findings(_limit_findings(errors, "unreadable images"), warnings)
 
 
 def inspect_poses(scene: Scene) -> Findings:
-    """Jumps between neighbouring frames, and a camera that never moves."""
-    step, angle_deg, neighbours = measure_steps(scene)
+    """Find jumps between neighbouring frames, and a camera that never moves."""
+    step, angle_deg, neighbours = _measure_steps(scene)
     if not len(step):
         return Findings([], [])
-    if not np.ptp(stack_positions(scene), axis=0).any():
+    if not np.ptp(_stack_positions(scene), axis=0).any():
         where = f"all {len(scene.frames)} positions are {scene.frames[0].position_m}"
         return Findings([f"{where}; there is nothing to learn, check the pose files"], [])
     typical = float(np.median(step))
@@ -101,11 +168,11 @@ def inspect_poses(scene: Scene) -> Findings:
         for k, i in enumerate(neighbours)
         if far[k] or turned[k]
     ]
-    return Findings([], limit_findings(jumps, "jumps"))
+    return Findings([], _limit_findings(jumps, "jumps"))
 
 
-def read_image_file(path: Path) -> ImageFile:
-    """Digest and size of an image file, or what is wrong with it."""
+def _read_image_file(path: Path) -> ImageFile:
+    """Read and decode an image file."""
     try:
         data = read_bytes(path)
         height, width = decode_image(data, path, color=False).shape
@@ -114,45 +181,50 @@ def read_image_file(path: Path) -> ImageFile:
     return ImageFile(hashlib.blake2b(data, digest_size=16).digest(), f"{width}x{height}")
 
 
-def measure_steps(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Distance and angle (degrees) from each frame to the next of its sequence, per index, and the frames."""
+def _measure_steps(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Measure the motion from each frame to the next one of its sequence.
+
+    Returns:
+        distance and angle (degrees) of each step, divided by the difference of the frames' numbers, and the rows of
+        the frames that the steps start from; each (S,).
+    """
     sequences = np.array([frame.sequence for frame in scene.frames])
     neighbours = np.flatnonzero(sequences[1:] == sequences[:-1])
-    positions, quats = stack_positions(scene), stack_quats(scene)
+    positions, quats = _stack_positions(scene), _stack_quats(scene)
     gap = np.maximum(np.diff([frame.index for frame in scene.frames])[neighbours], 1)
     step = np.linalg.norm(positions[neighbours + 1] - positions[neighbours], axis=1)
-    angle = find_angle_deg(quats[neighbours], quats[neighbours + 1])
+    angle = _find_angle_deg(quats[neighbours], quats[neighbours + 1])
     return step / gap, angle / gap, neighbours
 
 
-def stack_positions(scene: Scene) -> np.ndarray:
+def _stack_positions(scene: Scene) -> np.ndarray:
     """Camera centres of all frames, (F, 3), in the scene's unit."""
     return np.array([frame.position_m for frame in scene.frames])
 
 
-def stack_quats(scene: Scene) -> np.ndarray:
+def _stack_quats(scene: Scene) -> np.ndarray:
     """Orientations of all frames, (F, 4) wxyz, camera-to-world."""
     return np.array([frame.quat_wxyz for frame in scene.frames])
 
 
-def find_angle_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _find_angle_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Angles between unit quaternions, in degrees: (N,) of (4,) or (N, 4) and (N, 4)."""
     apart, together = np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)
-    # Not the arc cosine of the product: that has no digits left near zero.
+    # The arc cosine of the product would be inaccurate near zero.
     return np.degrees(4 * np.arctan2(np.minimum(apart, together), np.maximum(apart, together)))
 
 
-def map_frames_to_splits(scene: Scene) -> dict[int, str]:
+def _map_frames_to_splits(scene: Scene) -> dict[int, str]:
     """Frame index to the name of its split."""
     return {int(i): split for split, indices in scene.splits.items() for i in indices}
 
 
-def limit_findings(texts: list[str], what: str) -> list[str]:
-    """The first few, and how many there are in all."""
+def _limit_findings(texts: list[str], what: str) -> list[str]:
+    """The first `SHOWN` texts, and the number of all if there are more."""
     more = [f"{len(texts)} {what} in all"] if len(texts) > SHOWN else []
     return texts[:SHOWN] + more
 
 
-def format_counts(sizes: Counter[str]) -> str:
-    """The most frequent sizes in words, with their counts where there are several."""
+def _format_counts(sizes: Counter[str]) -> str:
+    """The most frequent sizes in words, with their counts if there are several sizes."""
     return ", ".join(size if len(sizes) == 1 else f"{size} ({count})" for size, count in sizes.most_common(SHOWN))

@@ -1,4 +1,4 @@
-"""The Scene: posed frames and their splits, the one form in which every dataset enters the project."""
+"""`Scene`: posed frames and their splits, into which every dataset is read."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ class Frame:
         quat_wxyz: (4,) float64, unit Hamilton quaternion, camera-to-world, OpenCV axes.
         sequence: name of the trajectory the frame belongs to.
         index: position of the frame in its sequence, as the dataset numbers it.
-        timestamp: seconds, where the dataset knows them.
-        intrinsics: the camera, where the format knows it.
+        timestamp: seconds; None if the dataset has none.
+        intrinsics: the camera; None if the format does not give it.
     """
 
     image: Path
@@ -48,7 +48,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Scene:
-    """Every frame of one place, and which of them train, validate and test.
+    """Every frame of one place, and which frames are for training, validation and test.
 
     Attributes:
         name: short name of the scene, the folder's name.
@@ -56,8 +56,9 @@ class Scene:
         format: name of the adapter that read it.
         frames: every frame; those of one sequence are consecutive and in order.
         splits: frame indices of each of `SPLITS`; disjoint.
-        split_source: `official` where the dataset has a split, `blocks` where the trajectory was cut.
-        unit: unit of the positions: `m`, or `scene` where the scale is arbitrary.
+        split_source: `official` if the dataset has a split, `blocks` if the trajectory was cut into blocks, `unseen` if
+            no frame of the test scenes is trained on.
+        unit: unit of the positions: `m`, or `scene` if the scale is arbitrary.
         ground_truth: where the poses come from (`original`, `sfm`, `synthetic`, ...).
     """
 

@@ -1,24 +1,23 @@
-"""Which frames train, validate and test: official splits where there are any, otherwise held-out blocks.
+"""Chooses frames for training, validation and test: official splits if a dataset has them, otherwise held-out blocks.
 
-Frames of a video are near copies of their neighbours, so a single held-out frame says nothing about a new
-place, and neither does a short block. Nor do one or two long blocks: they are one or two places. Measured on the
-training split of 7-Scenes' redkitchen, cut to 13 sequences of 50 frames, where the mean pose is 0.55 m off (median;
-0.59 m on the test split, whose frames lie 9 cm from the nearest training pose):
+Frames of a video are nearly copies of their neighbours, so the error of a single held-out frame, or of a short block,
+is not that of a new place. One or two long blocks are too few places. Measured on the training split of 7-Scenes'
+redkitchen, cut to 13 sequences of 50 frames, where the mean pose is 0.55 m off (median; 0.59 m on the test split,
+whose frames lie 9 cm from the nearest training pose):
 
 | held out                    | frames | to the nearest training pose | off the mean pose |
 |-----------------------------|--------|------------------------------|-------------------|
 | two whole sequences         | 100    | 13 cm                        | 0.22 m            |
 | halves of four sequences    | 100    | 4 cm                         | 0.47 m            |
 
-The two whole sequences happen to lie in the middle, where a network that has learned nothing does well: the best
-checkpoint by them was that of the first epoch. Hence, in this order:
+The two whole sequences happen to lie in the middle, where a network that has learned nothing has small errors: by
+them, the best checkpoint was that of the first epoch. The frames are therefore, in this order:
 
 - halves of at least four sequences, evenly spaced among the sequences, first and last halves in turn;
-- where that would hold out more than twice the fraction (one long trajectory, or a few), contiguous blocks,
-  evenly spaced over the trajectory: at most four, longer rather than more, and of 10 frames at least where
-  the fraction has as many.
+- if that would be more than twice the wanted fraction (there are only a few sequences), contiguous blocks, evenly
+  spaced over the trajectory: at most four, and each of at least 10 frames if so many are wanted.
 
-Everything is deterministic.
+The choice is deterministic.
 """
 
 from __future__ import annotations
@@ -33,7 +32,10 @@ from lightning_pose.scenes.scene import Scene
 __all__ = ["hold_out", "make_splits"]
 
 MAX_BLOCKS = 4
+"""Most blocks, and least halves of sequences, to hold out."""
+
 MIN_BLOCK = 10
+"""Frames that a block has at least, if so many are wanted."""
 
 
 def make_splits(
@@ -42,9 +44,9 @@ def make_splits(
     """Ascending frame indices of `train`, `val` and `test`, disjoint.
 
     Args:
-        scene: with the official `train` and `test` in its `splits`, or with none.
+        scene: with the official `train` and `test` in `splits`, or with empty `splits`.
         val_fraction: part of the training frames to validate on; 0 leaves `val` empty.
-        test_fraction: part of all frames to test on, where the scene has no official split.
+        test_fraction: part of all frames to test on, if the scene has no official split.
         val_block: see `hold_out`.
 
     Raises:
@@ -65,15 +67,15 @@ def make_splits(
 def hold_out(
     indices: np.ndarray, sequences: np.ndarray, fraction: float, setting: str, block: int = 1
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Divide frames into kept and held out.
+    """Divide frames into those kept and those held out.
 
     Args:
         indices: (N,) ascending frame indices to divide.
         sequences: the sequence of every frame of the scene.
         fraction: about which part of them to hold out; at least one frame unless it is 0.
-        setting: what the user calls the fraction, for the message.
-        block: hold out runs of this many frames at least (clips need them), where sequences are that long: rather
-            than halves, whole sequences, and longer blocks.
+        setting: name of the fraction in the user's settings, for the message.
+        block: least number of consecutive frames to hold out (clips need them), if sequences are that long; whole
+            sequences or longer blocks are chosen where halves are shorter.
 
     Returns:
         the kept and the held-out indices, ascending.
@@ -88,18 +90,20 @@ def hold_out(
     wanted = max(1, round(fraction * len(indices)))
     if wanted >= len(indices):
         raise ConfigError(f"{setting} {fraction} leaves none of {len(indices)} frames to train on; lower it")
-    held = _halves(indices, sequences[indices], wanted, block)
+    held = _choose_halves(indices, sequences[indices], wanted, block)
     if held is None:
-        held = _whole(indices, sequences[indices], wanted, block)
+        held = _choose_sequences(indices, sequences[indices], wanted, block)
     if held is None:
-        held = _blocks(indices, sequences, wanted, block)
+        held = _choose_blocks(indices, sequences, wanted, block)
     return np.setdiff1d(indices, held), held
 
 
-def _halves(indices: np.ndarray, sequence_of: np.ndarray, wanted: int, block: int) -> np.ndarray | None:
-    """Halves of evenly spaced sequences, `wanted` frames or more; None where that takes far too many frames, or a half
-    is shorter than a block."""
-    names, lengths = _sequences(sequence_of)
+def _choose_halves(indices: np.ndarray, sequence_of: np.ndarray, wanted: int, block: int) -> np.ndarray | None:
+    """Halves of evenly spaced sequences, `wanted` frames or more.
+
+    None if that would be more than twice as many frames, or if a half is shorter than a block.
+    """
+    names, lengths = _count_sequences(sequence_of)
     half = int(np.median(lengths)) // 2
     if half < block or MAX_BLOCKS * half > 2 * wanted:
         return None
@@ -107,38 +111,42 @@ def _halves(indices: np.ndarray, sequence_of: np.ndarray, wanted: int, block: in
     if count > len(names):
         return None
     held = []
-    for i, place in enumerate(_evenly(count, len(names))):
+    for i, place in enumerate(_space_evenly(count, len(names))):
         members = indices[sequence_of == names[place]]
         middle = len(members) // 2
         held.append(members[middle:] if i % 2 == 0 else members[:middle])
     return np.sort(np.concatenate(held))
 
 
-def _whole(indices: np.ndarray, sequence_of: np.ndarray, wanted: int, block: int) -> np.ndarray | None:
-    """Evenly spaced whole sequences, `wanted` frames or more; None where halves or parts of one are a block as well."""
-    names, lengths = _sequences(sequence_of)
+def _choose_sequences(indices: np.ndarray, sequence_of: np.ndarray, wanted: int, block: int) -> np.ndarray | None:
+    """Evenly spaced whole sequences, `wanted` frames or more.
+
+    None unless half a sequence is shorter than a block and a whole one is not; None if that would be more than twice
+    as many frames, or every sequence.
+    """
+    names, lengths = _count_sequences(sequence_of)
     length = int(np.median(lengths))
     count = -(-wanted // length)
     if not length // 2 < block <= length or length > 2 * wanted or count >= len(names):
         return None
-    return indices[np.isin(sequence_of, [names[place] for place in _evenly(count, len(names))])]
+    return indices[np.isin(sequence_of, [names[place] for place in _space_evenly(count, len(names))])]
 
 
-def _sequences(sequence_of: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Names of sequences as they come in the scene, and how many frames each has."""
+def _count_sequences(sequence_of: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Names of sequences in the scene's order, and how many frames each has."""
     names, first, lengths = np.unique(sequence_of, return_index=True, return_counts=True)
     order = np.argsort(first)
     return names[order], lengths[order]
 
 
-def _blocks(indices: np.ndarray, sequences: np.ndarray, wanted: int, block: int) -> np.ndarray:
-    """Evenly spaced blocks, `wanted` frames together, none across a gap or the border of two sequences."""
+def _choose_blocks(indices: np.ndarray, sequences: np.ndarray, wanted: int, block: int) -> np.ndarray:
+    """Evenly spaced blocks, `wanted` frames together, none of them across a gap or the end of a sequence."""
     breaks = np.flatnonzero((np.diff(indices) > 1) | (sequences[indices[1:]] != sequences[indices[:-1]])) + 1
     runs = np.array([0, *breaks, len(indices)])
     count = min(max(wanted // max(MIN_BLOCK, block), 1), MAX_BLOCKS)
     lengths = [max(block, len(part)) for part in np.array_split(np.arange(wanted), count)]
     held = []
-    for centre, length in zip(_evenly(count, len(indices)), lengths, strict=True):
+    for centre, length in zip(_space_evenly(count, len(indices)), lengths, strict=True):
         run = np.searchsorted(runs, centre, side="right") - 1
         length = min(length, runs[run + 1] - runs[run])
         start = np.clip(centre - length // 2, runs[run], runs[run + 1] - length)
@@ -146,6 +154,6 @@ def _blocks(indices: np.ndarray, sequences: np.ndarray, wanted: int, block: int)
     return np.unique(np.concatenate(held))
 
 
-def _evenly(count: int, total: int) -> list[int]:
+def _space_evenly(count: int, total: int) -> list[int]:
     """The middles of `count` equal parts of 0..total-1."""
     return [(2 * i + 1) * total // (2 * count) for i in range(count)]

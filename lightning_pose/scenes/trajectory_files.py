@@ -1,4 +1,4 @@
-"""TUM trajectory files: `timestamp tx ty tz qx qy qz qw`, one pose a line, as evo and the TUM tools read them."""
+"""TUM trajectory files: `timestamp tx ty tz qx qy qz qw`, one pose per line, as evo and the TUM tools read them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def write_tum(path: Path, timestamps: Sequence[float], position_m: np.ndarray, q
     """Write M camera-to-world poses.
 
     Args:
-        path: the file; its folder is made.
+        path: the file; its folder is made if it is missing.
         timestamps: M seconds.
         position_m: (M, 3).
         quat_wxyz: (M, 4); the file has the scalar last.
@@ -27,9 +27,9 @@ def write_tum(path: Path, timestamps: Sequence[float], position_m: np.ndarray, q
 
 
 def write_sequences(folder: Path, frames: Iterable[Frame], position_m: np.ndarray, quat_wxyz: np.ndarray) -> list[Path]:
-    """Write the poses of frames into one file a sequence, `folder/SEQUENCE.tum`, and return the files.
+    """Write the poses of each sequence's frames into `folder/SEQUENCE.tum`, and return the files.
 
-    A frame's number stands in for its time where the dataset has none.
+    If the dataset has no times, the number of a frame is written in place of its time.
     """
     rows: dict[str, list[int]] = {}
     frames = list(frames)
@@ -37,11 +37,12 @@ def write_sequences(folder: Path, frames: Iterable[Frame], position_m: np.ndarra
         rows.setdefault(frame.sequence, []).append(i)
     files = []
     for sequence, members in rows.items():
-        times = [_time(frames[i]) for i in members]
+        times = [_find_time(frames[i]) for i in members]
         files.append(folder / f"{sequence.replace('/', '_')}.tum")
         write_tum(files[-1], times, position_m[members], quat_wxyz[members])
     return files
 
 
-def _time(frame: Frame) -> float:
+def _find_time(frame: Frame) -> float:
+    """Seconds, or the frame's number if the dataset has no times."""
     return float(frame.index) if frame.timestamp is None else frame.timestamp

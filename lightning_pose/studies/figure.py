@@ -14,8 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
 from lightning_pose.features.keypoint_statistics import FrameKeypoints
-from lightning_pose.figures.clips import CLIP_BASELINES
-from lightning_pose.figures.style import BASELINES, MODEL, OTHERS, STYLE, log_axis
+from lightning_pose.figures.style import BASELINES, CLIP_BASELINES, MODEL, OTHERS, STYLE, log_axis
 from lightning_pose.scenes.images import read_rgb
 from lightning_pose.studies.figure_spec import FigureSpec
 from lightning_pose.studies.table import Group, varying_settings

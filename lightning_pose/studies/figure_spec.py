@@ -6,13 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from lightning_pose.errors import ConfigError
+from lightning_pose.metrics.catalog import MEDIANS, find_metric
 from lightning_pose.sweeps.space import BASE, MEASURES, Parameter, normalize_key, suggest_name
 
 __all__ = ["FigureSpec", "parse_figure_spec"]
 
 KINDS = ("line", "bar", "curve", "pictures")
 FIELDS = ("x", "y", "kind", "log", "beside", "title", "table", "labels")
-ERRORS = ("position_median_m", "orientation_median_deg")
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class FigureSpec:
 
     def label(self, name: str) -> str:
         """The text for a setting or a metric on axes and in tables."""
-        return self.labels.get(name) or _spelt(name)
+        return self.labels.get(name) or _default_label(name)
 
 
 def parse_figure_spec(raw: object, measure: str | None, space: Sequence[Parameter]) -> FigureSpec | None:
@@ -63,7 +63,7 @@ def parse_figure_spec(raw: object, measure: str | None, space: Sequence[Paramete
         raise ConfigError(f"figure.kind is {kind!r}; {suggest_name(str(kind), KINDS)}")
     y = _parse_names(raw.get("y", []), "y")
     if not y and kind != "pictures":
-        y = tuple(f"{'test' if measure == 'test' else 'val'}/{name}" for name in ERRORS)
+        y = tuple(f"{'test' if measure == 'test' else 'val'}/{name}" for name in MEDIANS)
     table = _parse_names(raw.get("table", []), "table")
     for metric in (*y, *table):
         if not metric.startswith(MEASURES[measure]):
@@ -115,22 +115,13 @@ def _parse_labels(raw: object) -> dict[str, str]:
     return {str(name): str(label) for name, label in raw.items()}
 
 
-SPELT = {
-    "position_median_m": "median position error (m)",
-    "orientation_median_deg": "median orientation error (°)",
-    "train_seconds": "training time (s)",
-    "parameters": "parameters",
-    "layers": "layers",
-    "ms_per_frame": "network, ms a frame",
-    "features_ms_per_frame": "features, ms a frame",
-    "frame_bytes": "bytes of a frame's features",
-    "checkpoint_bytes": "bytes of the weights' file",
-    "class_path": "features",
-    "root": "scene",
-    BASE: "system",
-}
+SETTING_LABELS = {"class_path": "features", "root": "scene", BASE: "system"}
 
 
-def _spelt(name: str) -> str:
+def _default_label(name: str) -> str:
+    """A metric's title and unit, or the last part of a setting's name, with spaces."""
+    metric = find_metric(name) if "/" in name else None
+    if metric is not None:
+        return metric.label
     last = name.rpartition("/")[2] if "/" in name else name.rpartition(".")[2]
-    return SPELT.get(last, last.replace("_", " "))
+    return SETTING_LABELS.get(last, last.replace("_", " "))

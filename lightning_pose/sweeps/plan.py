@@ -8,10 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from lightning_pose.errors import ConfigError
-from lightning_pose.metrics.summary import summarize_errors
+from lightning_pose.metrics import catalog
 from lightning_pose.paths import default_tracking_uri
 from lightning_pose.sweeps.base_config import ParsedConfig, change_value, check_settings, read_yaml, write_options
 from lightning_pose.sweeps.space import (
@@ -29,8 +27,8 @@ from lightning_pose.sweeps.space import (
 __all__ = ["MEASURES", "Objective", "Plan", "read_plan"]
 
 FIELDS = ("base", "objective", "sampler", "pruner", "n_trials", "seed", "settings", "space", "measure", "figure")
-COSTS = ("cost/parameters", "cost/layers", "cost/train_seconds", "cost/ms_per_frame", "cost/features_ms_per_frame")
-MEASURED = [f"val/{name}" for name in ("loss", *summarize_errors(np.zeros(1), np.zeros(1)))]
+COSTS = tuple(f"cost/{name}" for name, cost in catalog.COSTS.items() if cost.objective)
+MEASURED = ("val/loss", *(f"val/{name}" for name in catalog.ERRORS))
 SCENES = ("data.root", "data.train_scenes", "data.test_scenes", "data.room_seed", "data.train_rooms", "data.test_rooms")
 FEATURES = ("features/count_median", "features/count_mean")
 
@@ -260,7 +258,8 @@ def _parse_objective(entry: object, known: Sequence[str]) -> Objective:
         raise ConfigError(f"objective {metric} is measured on test frames, which must not choose; take its val/ name")
     if metric not in known:
         raise ConfigError(f"objective {metric} is not known; {suggest_name(metric, known)}")
-    goal = named.get("goal", "maximize" if "recall" in metric else "minimize")
+    known_metric = catalog.find_metric(metric)
+    goal = named.get("goal", "maximize" if known_metric and known_metric.higher_is_better else "minimize")
     if goal not in ("minimize", "maximize"):
         raise ConfigError(f"objective {metric} has goal {goal!r}; give minimize or maximize")
     return Objective(metric, goal == "maximize")

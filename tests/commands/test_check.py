@@ -1,4 +1,4 @@
-"""The verb `check`: what it says of a sound dataset, and what it finds in spoiled ones."""
+"""The command `check`: its output for a sound dataset, and the errors and warnings for others."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The verb `extract`: it fills the cache, says what it did, and does nothing twice."""
+"""The command `extract`: it fills the cache, prints what it did, and extracts nothing twice."""
 
 from __future__ import annotations
 

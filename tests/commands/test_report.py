@@ -55,7 +55,7 @@ def test_the_table(capsys: pytest.CaptureFixture[str]) -> None:
     assert table["NodePose"][:4] == ["cnn", "0.098 / 6.50", "–", "0.098 / 6.50 [1 of 2]"]
     assert table["SurfLSTM"] == [
         "surf", "0.187 / 6.30", "0.251 / 8.00", "0.219 / 7.15", "1.61 / 0.96",
-        "375,807", "84.2", "0.5", "9.5", "12.8 kB", "1.5 MB",
+        "375,807", "", "84.2", "0.5", "9.5", "12.8 kB", "1.5 MB",
     ]  # fmt: skip
     assert table["oracle"][1] == "0.094 / 2.90"
     assert table["SurfCNN 300 †"][:2] == ["table 2.3", "0.37 / 10.25"]
@@ -173,7 +173,7 @@ def test_a_file_by_its_name(suffix: str, begins: str, tmp_path: Path, capsys: py
         (["--chapter", "2"], "--chapter chooses among published rows; give --published as well"),
         (["--chapter", "7", "--published"], "invalid choice: 7"),
         (["--format", "excel"], "invalid choice: 'excel'"),
-        (["--by", "unit_s"], "no run tells 'unit_s'"),
+        (["--by", "unit_s"], "no run has 'unit_s'"),
         (["--pick", "spread"], "2 runs differ in model.units (100, 50)"),
         (["--out", "/dev/null/report.md"], "--out /dev/null/report.md cannot be written"),
         (["--tracking_uri", "sqlite:///nowhere.db"], "sqlite:///nowhere.db does not exist"),
@@ -227,5 +227,5 @@ def test_a_real_run(trained: Trained, capsys: pytest.CaptureFixture[str]) -> Non
     assert list(by_name) == ["SurfLSTM", "train_mean", "retrieval_top1", "retrieval_top5", "oracle"]
     assert by_name["SurfLSTM"]["position_median_m"] == metrics["test/position_median_m"]
     assert by_name["oracle"]["orientation_median_deg"] == metrics["baseline/oracle/orientation_median_deg"]
-    assert "do not tell" not in " ".join(report["notes"])
+    assert "do not record" not in " ".join(report["notes"])
     assert "no published row" in " ".join(report["notes"])

@@ -1,4 +1,4 @@
-"""The verb `synth`: what it writes, what it says, and what it refuses."""
+"""The command `synth`: what it writes, prints and refuses."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from lightning_pose.commands.synth import main
 from lightning_pose.errors import ConfigError
 
 
-def test_renders_a_room_and_says_what_next(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_renders_a_room_and_prints_the_next_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     root = tmp_path / "deep" / "room"
     assert main([str(root), "--seed", "3", "--frames", "6", "--size", "64x48"]) == 0
     assert len(list(root.rglob("*.color.png"))) == 6
-    told = capsys.readouterr().out
-    assert f"{root} holds room 3: 6 frames of 64x48 pixels" in told
-    assert f"--data.root {root}" in told
+    printed = capsys.readouterr().out
+    assert f"{root} holds room 3: 6 frames of 64x48 pixels" in printed
+    assert f"--data.root {root}" in printed
 
 
 @pytest.mark.parametrize("size", ["320", "320x", "axb", "1x2x3"])
@@ -32,12 +32,12 @@ def test_a_value_out_of_range_is_a_pose_error(tmp_path: Path) -> None:
         main([str(tmp_path / "room"), "--frames", "2"])
 
 
-def test_help_teaches(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_has_examples(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="0"):
         main(["--help"])
-    told = capsys.readouterr().out
-    assert "7-Scenes layout" in told
-    assert "python -m lightning_pose synth rooms/1 --seed 1" in told
+    printed = capsys.readouterr().out
+    assert "7-Scenes layout" in printed
+    assert "python -m lightning_pose synth rooms/1 --seed 1" in printed
 
 
 def test_rendering_needs_no_torch() -> None:

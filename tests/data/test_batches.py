@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from lightning_pose.data.batches import DrawnDataset, PoseBatch, PoseDataset, batch_loader
+from lightning_pose.data.batches import DrawnDataset, PoseBatch, PoseDataset, make_loader
 
 
 def dataset(count: int = 10) -> PoseDataset:
@@ -24,7 +24,7 @@ def test_one_frame_and_many() -> None:
 
 
 def test_a_loader_in_order() -> None:
-    batches = list(batch_loader(dataset(), 4, shuffle=False))
+    batches = list(make_loader(dataset(), 4, shuffle=False))
     assert [len(batch.frame) for batch in batches] == [4, 4, 2]
     assert torch.cat([batch.frame for batch in batches]).tolist() == list(range(100, 110))
     assert all(isinstance(batch, PoseBatch) for batch in batches)
@@ -32,7 +32,7 @@ def test_a_loader_in_order() -> None:
 
 def test_a_shuffled_loader_has_every_frame_once_and_its_own_pose() -> None:
     torch.manual_seed(0)
-    batches = list(batch_loader(dataset(), 4, shuffle=True))
+    batches = list(make_loader(dataset(), 4, shuffle=True))
     frame = torch.cat([batch.frame for batch in batches])
     assert frame.tolist() != sorted(frame.tolist())
     assert sorted(frame.tolist()) == list(range(100, 110))

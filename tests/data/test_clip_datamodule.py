@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from lightning_pose.checkpoint import build
+from lightning_pose.checkpoint import build_object
 from lightning_pose.data import ClipDataModule
 from lightning_pose.errors import ConfigError, DataError
 from lightning_pose.features import ORB, SURF, Pixels
@@ -74,7 +74,7 @@ def test_test_clips_are_fixed_and_training_clips_are_not(scene: Path) -> None:
     assert any(not torch.equal(train[0], other) for other in train[1:])
 
 
-def test_training_varies_as_it_is_told(scene: Path) -> None:
+def test_training_varies_as_it_is_set(scene: Path) -> None:
     data = module(root=str(scene), val_fraction=0.0, max_stride=3, reverse=True)
     strides = {int(row.diff()[0]) for _ in range(10) for batch in data.train_dataloader() for row in batch.frame}
     assert strides == {-3, -2, -1, 1, 2, 3}
@@ -106,8 +106,8 @@ def test_nothing_named_is_rooms(monkeypatch: pytest.MonkeyPatch, scene: Path, ot
 def test_its_description_rebuilds_it(scene: Path) -> None:
     data = module(root=str(scene), stride=2, mirror=False)
     spec = data.describe()
-    spec["init_args"]["extractor"] = build(spec["init_args"]["extractor"])
-    assert build(spec).describe() == data.describe()
+    spec["init_args"]["extractor"] = build_object(spec["init_args"]["extractor"])
+    assert build_object(spec).describe() == data.describe()
 
 
 @pytest.mark.parametrize("extractor", [SURF(5), SURF(5, with_geometry=True), Pixels(8, 8)])

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from lightning_pose.data.batches import PoseBatch
-from lightning_pose.data.clip_dataset import Augmentation, ClipDataset, ClipShape, find_runs, mirrored_poses
+from lightning_pose.data.clip_dataset import Augmentation, ClipDataset, ClipShape, find_runs, mirror_poses
 from lightning_pose.errors import ConfigError, DataError
 from lightning_pose.geometry.quaternions import orientation_error_deg, quat_normalize, quat_to_matrix
 from lightning_pose.geometry.relative import relative_poses
@@ -127,7 +127,7 @@ def test_reversed_clips_have_the_poses_of_the_way_back() -> None:
 def test_mirrored_poses_are_those_of_the_mirrored_world() -> None:
     position_m, quat_wxyz = data(5).position_m, data(5).quat_wxyz
     mirror = torch.diag(torch.tensor([-1.0, 1, 1]))
-    mirrored = mirrored_poses(position_m, quat_wxyz)
+    mirrored = mirror_poses(position_m, quat_wxyz)
     torch.testing.assert_close(mirrored[0], position_m @ mirror)
     torch.testing.assert_close(quat_to_matrix(mirrored[1]), mirror @ quat_to_matrix(quat_wxyz) @ mirror)
     # A point straight ahead and to the right of a camera is to the left of the mirrored one.
@@ -144,7 +144,7 @@ def test_half_of_the_clips_are_mirrored_with_their_features() -> None:
     assert 5 < sum(turned) < 35
     plain = clips()[1]
     for batch, is_turned in zip(drawn, turned, strict=True):
-        expected = mirrored_poses(plain.position_m, plain.quat_wxyz) if is_turned else plain[1:3]
+        expected = mirror_poses(plain.position_m, plain.quat_wxyz) if is_turned else plain[1:3]
         torch.testing.assert_close(batch.position_m, expected[0])
         assert orientation_error_deg(batch.quat_wxyz, expected[1]).max() < 1e-3
     assert torch.equal(dataset.data.features, data().features), "the shared frames stay as they are"
@@ -171,7 +171,7 @@ def test_a_clip_longer_than_every_run_is_refused() -> None:
         clips(8, stride=3)
 
 
-def test_short_runs_are_left_out_and_told(caplog: pytest.LogCaptureFixture) -> None:
+def test_short_runs_are_left_out_with_a_warning(caplog: pytest.LogCaptureFixture) -> None:
     dataset = ClipDataset(data(), [np.arange(10), np.arange(10, 13), np.arange(13, 30)], ClipShape(5))
     assert not {10, 11, 12} & set(dataset.rows().flatten().tolist())
     assert "1 of 3 runs of frames are shorter than a clip (5) and left out" in caplog.text

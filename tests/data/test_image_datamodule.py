@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from lightning_pose.checkpoint import build
+from lightning_pose.checkpoint import build_object
 from lightning_pose.data import ImageDataModule, datamodule
 from lightning_pose.errors import ConfigError, DataError, ImageError
 from lightning_pose.features import ORB
@@ -95,9 +95,10 @@ def test_no_validation_frames_is_no_loader(scene: Path) -> None:
     assert len(data.dataset("train")) == 24
 
 
-def test_no_test_frames_is_an_error(scene: Path) -> None:
+def test_no_test_frames_is_an_error(monkeypatch: pytest.MonkeyPatch, scene: Path) -> None:
     data = module(scene)
-    data._scene = replace(data.scene, splits={**data.scene.splits, "test": np.array([], int)})
+    without = replace(data.scene, splits={**data.scene.splits, "test": np.array([], int)})
+    monkeypatch.setattr(ImageDataModule, "scene", without)
     with pytest.raises(DataError, match=f"{scene} has no test frames; give"):
         data.test_dataloader()
 
@@ -122,14 +123,14 @@ def test_without_a_folder_a_room_is_rendered(monkeypatch: pytest.MonkeyPatch, tm
 
 def test_a_description_rebuilds_it(scene: Path, tmp_path: Path) -> None:
     data = module(scene, batch_size=7, cache_dir=str(tmp_path))
-    rebuilt = build(_built_extractor(data.describe()))
+    rebuilt = build_object(_built_extractor(data.describe()))
     assert rebuilt.describe() == data.describe()
     assert rebuilt.batch_size == 7
     assert rebuilt.cache.folder == data.cache.folder
 
 
 def _built_extractor(spec: dict[str, Any]) -> dict[str, Any]:
-    return {**spec, "init_args": {**spec["init_args"], "extractor": build(spec["init_args"]["extractor"])}}
+    return {**spec, "init_args": {**spec["init_args"], "extractor": build_object(spec["init_args"]["extractor"])}}
 
 
 def test_a_missing_image_is_named(scene: Path, tmp_path: Path) -> None:

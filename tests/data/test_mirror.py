@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from lightning_pose.data.clip_dataset import mirrored_poses
+from lightning_pose.data.clip_dataset import mirror_poses
 
 C, S = math.cos(0.2), math.sin(0.2)
 
@@ -21,6 +21,6 @@ C, S = math.cos(0.2), math.sin(0.2)
     ],
 )
 def test_turns_about_each_axis(quat_wxyz: list[float], expected: list[float]) -> None:
-    position_m, turned = mirrored_poses(torch.tensor([[1.0, 2.0, 3.0]]), torch.tensor([quat_wxyz]))
+    position_m, turned = mirror_poses(torch.tensor([[1.0, 2.0, 3.0]]), torch.tensor([quat_wxyz]))
     assert position_m.tolist() == [[-1.0, 2.0, 3.0]]
     torch.testing.assert_close(turned, torch.tensor([expected]))

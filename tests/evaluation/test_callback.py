@@ -21,13 +21,13 @@ from lightning_pose.scenes.formats import load_scene
 from tests.helpers import Trained, Workplace
 
 
-def trajectory(trained: Trained, name: str) -> np.ndarray:
+def read_trajectory(trained: Trained, name: str) -> np.ndarray:
     path = trained.workplace.client.download_artifacts(trained.run.info.run_id, f"trajectories/{name}/seq-03.tum")
     return np.loadtxt(path)
 
 
 def test_the_metrics_are_those_of_the_trajectories(trained: Trained) -> None:
-    truth, prediction = (torch.from_numpy(trajectory(trained, name)) for name in ("truth", "predictions"))
+    truth, prediction = (torch.from_numpy(read_trajectory(trained, name)) for name in ("truth", "predictions"))
     expected = summarize_errors(
         position_error_m(prediction[:, 1:4], truth[:, 1:4]),
         orientation_error_deg(prediction[:, [7, 4, 5, 6]], truth[:, [7, 4, 5, 6]]),
@@ -39,7 +39,7 @@ def test_the_metrics_are_those_of_the_trajectories(trained: Trained) -> None:
 def test_the_truth_is_the_scene_s(trained: Trained, scene: Path) -> None:
     loaded = load_scene(scene)
     positions = [loaded.frames[i].position_m for i in loaded.splits["test"]]
-    np.testing.assert_allclose(trajectory(trained, "truth")[:, 1:4], positions, atol=1e-6)
+    np.testing.assert_allclose(read_trajectory(trained, "truth")[:, 1:4], positions, atol=1e-6)
 
 
 def test_baselines_by_hand(trained: Trained, scene: Path) -> None:

@@ -9,26 +9,29 @@ from typing import Any
 
 import pytest
 import torch
-from lightning import LightningModule, Trainer
+from lightning import Trainer
 from torch import Tensor
 
 from lightning_pose.evaluation.costs import costs
+from lightning_pose.models import Pose, PoseModule
 from tests.models.helpers import LearnableProblem
 
 
-class SlowAtFirst(LightningModule):
+class SlowAtFirst(PoseModule):
     """A model whose first call takes 1 s of the test's clock, and every other 2 ms."""
 
+    input_ranks = (1,)
+
     def __init__(self, clock: Any) -> None:
-        super().__init__()
+        super().__init__(input_shape=[4])
         self.network = torch.nn.Linear(4, 7)
         self.clock = clock
         self.calls = 0
 
-    def forward(self, features: Tensor) -> Tensor:
+    def forward(self, features: Tensor) -> Pose:
         self.clock.seconds += 0.002 if self.calls else 1.0
         self.calls += 1
-        return self.network(features)
+        return super().forward(features)
 
 
 def test_the_first_call_is_not_measured(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

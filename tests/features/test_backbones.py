@@ -76,7 +76,7 @@ def test_half_precision_and_no_batch_counts(tmp_path: Path) -> None:
 
 
 def test_densenet_s_old_names(tmp_path: Path) -> None:
-    """torchvision's own file says `norm.1` where its module says `norm1`."""
+    """torchvision's own file has `norm.1` where its module has `norm1`."""
     module = build_backbone("densenet121", "none")
     assert isinstance(module, Backbone)
     old = {}
@@ -100,11 +100,11 @@ def test_densenet_s_old_names(tmp_path: Path) -> None:
     ],
 )
 def test_failed_download(backbone: str, weights: str, url: str, project: str, hub: Path, no_network: None) -> None:
-    said = (
+    message = (
         f"the {weights} weights of {backbone} cannot be downloaded .*no network.*download {url} of {project}.*"
         f"put it at {hub}/{backbone}.*or give its path as `weights`"
     )
-    with pytest.raises(CheckpointError, match=said):
+    with pytest.raises(CheckpointError, match=message):
         build_backbone(backbone, weights)
     assert socket.getdefaulttimeout() is None
 

@@ -1,4 +1,4 @@
-"""Tests of the extractor contract: prefix, geometry columns, names."""
+"""Tests of the extractors' base classes: prefix, geometry columns, names."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of the feature cache: each image once, whatever happens meanwhile."""
+"""Tests of the feature cache: each image is extracted once, also after errors, kills and damage."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import pytest
 import torch
 
 from lightning_pose.errors import CacheError, ConfigError, ImageError
-from lightning_pose.features import cache as cache_module
+from lightning_pose.features import fill_job
 from lightning_pose.features.base import Record
 from lightning_pose.features.cache import FeatureCache
 from lightning_pose.features.opencv import BRIEF
@@ -57,7 +57,7 @@ def start_filling(images: Path, root: Path) -> subprocess.Popen[str]:
     )
 
 
-def go(process: subprocess.Popen[str]) -> None:
+def start_fill(process: subprocess.Popen[str]) -> None:
     assert process.stdin is not None
     assert process.stdout is not None
     assert process.stdout.readline() == "ready\n"
@@ -116,7 +116,7 @@ def test_settings_have_their_own_folder(tmp_path: Path) -> None:
     assert about["settings"] == {"scale": 2.0}
 
 
-def test_fewer_features_are_a_prefix_and_cost_nothing(tmp_path: Path) -> None:
+def test_fewer_features_are_a_prefix_and_nothing_is_extracted(tmp_path: Path) -> None:
     path = tmp_path / "noise.png"
     cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 256, (160, 200), np.uint8))
     many = FeatureCache(BRIEF(300), tmp_path / "cache").features([path])
@@ -125,11 +125,11 @@ def test_fewer_features_are_a_prefix_and_cost_nothing(tmp_path: Path) -> None:
     np.testing.assert_array_equal(few.features([path])[..., :256], many[:, :50])
 
 
-def test_records_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cache_module, "_CHUNK", 4)
-    paths = write_images(tmp_path / "images", 10)
-    records = FeatureCache(ColorMeans(), tmp_path / "cache").records([*paths, paths[0]], progress=False)
-    np.testing.assert_array_equal([r["means"] for r in records], expected(10)[[*range(10), 0]])
+def test_records_in_order(tmp_path: Path) -> None:
+    paths = write_images(tmp_path / "images", 100)
+    asked = [*range(100), *range(50)]  # more than twice as many as are in memory at a time
+    records = FeatureCache(ColorMeans(), tmp_path / "cache").records([paths[i] for i in asked], progress=False)
+    np.testing.assert_array_equal([r["means"] for r in records], expected(100)[asked])
 
 
 @pytest.mark.parametrize(
@@ -138,7 +138,7 @@ def test_records_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     ids=["truncated", "empty", "flipped"],
 )
 @pytest.mark.parametrize("call", ["fill", "features"])
-def test_damaged_file_is_told_and_redone(
+def test_damaged_file_is_reported_and_redone(
     call: str, damage: Callable[[bytes], bytes], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     paths = write_images(tmp_path / "images", 5)
@@ -175,7 +175,7 @@ def test_many_bad_images_are_counted(tmp_path: Path) -> None:
         FeatureCache(ColorMeans(), tmp_path).fill([tmp_path / f"{n}.png" for n in range(9)])
 
 
-def test_one_bad_image_speaks_for_itself(tmp_path: Path) -> None:
+def test_one_bad_image_gives_its_own_error(tmp_path: Path) -> None:
     with pytest.raises(ImageError, match=r"^.*gone\.png does not exist; check the path"):
         FeatureCache(ColorMeans(), tmp_path).features([tmp_path / "gone.png"])
 
@@ -183,7 +183,7 @@ def test_one_bad_image_speaks_for_itself(tmp_path: Path) -> None:
 def test_image_that_changes_meanwhile_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     first, second = write_images(tmp_path / "images", 2)
     contents = iter([first.read_bytes(), second.read_bytes()])
-    monkeypatch.setattr(cache_module, "read_bytes", lambda path: next(contents))
+    monkeypatch.setattr(fill_job, "read_bytes", lambda path: next(contents))
     cache = FeatureCache(ColorMeans(), tmp_path / "cache")
     with pytest.raises(ImageError, match=r"000\.png changed while it was read; run again"):
         cache.fill([first], progress=False)
@@ -194,14 +194,14 @@ def test_resumes_after_a_kill(tmp_path: Path) -> None:
     paths = write_images(tmp_path / "images", 100)
     root = tmp_path / "cache"
     with start_filling(tmp_path / "images", root) as process:
-        go(process)
+        start_fill(process)
         while len(records_in(root)) < 20:
             assert process.poll() is None
             time.sleep(0.005)
         process.kill()
     saved = records_in(root)
     assert 20 <= len(saved) < 100
-    assert all(read_record(file) for file in saved)  # none is torn
+    assert all(read_record(file) for file in saved)  # none is cut short
 
     cache = FeatureCache(ColorMeans(), root)
     report = cache.fill(paths, progress=False)
@@ -213,7 +213,7 @@ def test_two_processes_at_once(tmp_path: Path) -> None:
     paths = write_images(tmp_path / "images", 60)
     cache = FeatureCache(extractor := ColorMeans(seconds=0.02), tmp_path / "cache")
     with start_filling(tmp_path / "images", cache.root) as other:
-        go(other)
+        start_fill(other)
         np.testing.assert_array_equal(cache.features(paths, workers=2, progress=False), expected(60))
         report, _ = other.communicate(timeout=60)
     assert other.returncode == 0
@@ -257,7 +257,9 @@ def test_extractor_error_passes_through(tmp_path: Path) -> None:
     assert (torch.get_num_threads(), cv2.getNumThreads()) == before
 
 
-def test_no_more_threads_than_cores(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("workers", [4, None], ids=["given", "as many as cores"])
+def test_no_more_threads_than_workers(workers: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(4)), raising=False)
     inside: list[int] = []
 
     class Curious(ColorMeans):
@@ -265,15 +267,15 @@ def test_no_more_threads_than_cores(tmp_path: Path, monkeypatch: pytest.MonkeyPa
             inside.append(torch.get_num_threads())
             return super().extract(images)
 
-    monkeypatch.setattr(cache_module, "_cores", lambda: 4)
-    cache = FeatureCache(Curious(), tmp_path / "cache")
+    extractor = Curious()
+    cache = FeatureCache(extractor, tmp_path / "cache")
     paths = write_images(tmp_path / "images", 40)
-    cache.fill(paths[:1], progress=False)
+    cache.fill(paths[:1], workers, progress=False)
     assert inside == [4]
     inside.clear()
-    cache.fill(paths, progress=False)
+    cache.fill(paths, workers, progress=False)
     assert set(inside) == {1}
-    assert max(cache.extractor.seen) <= 8  # pyright: ignore[reportAttributeAccessIssue]
+    assert max(extractor.seen) <= 8
 
 
 def test_workers_must_be_positive(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Tests of the frozen CNN extractor: what the network sees, what is stored, what keys the cache."""
+"""Tests of the frozen CNN extractor: the network's input, the stored features, the settings that key the cache."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from lightning_pose.checkpoint import build, describe
+from lightning_pose.checkpoint import build_object, describe_object
 from lightning_pose.errors import CheckpointError, ConfigError, ImageError
 from lightning_pose.features import CNN, FeatureCache
 from tests.features.helpers import write_images
@@ -67,7 +67,7 @@ class Pooled(Pixels):
 
 
 class Scalar(Pixels):
-    """One that breaks the contract."""
+    """One that returns another shape than `build_backbone` asks for."""
 
     def forward(self, rgb: Tensor) -> Tensor:
         return rgb.mean((1, 2, 3))
@@ -204,7 +204,7 @@ def test_module_by_class_path_takes_a_checkpoint(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("backbone", "output", "said"),
+    ("backbone", "output", "message"),
     [
         ("Pooled", "map", r"returned \(3,\) for each image, but output is map; its forward must"),
         ("Scalar", "vector", r"returned \(\) for each image, but output is vector"),
@@ -213,8 +213,8 @@ def test_module_by_class_path_takes_a_checkpoint(tmp_path: Path) -> None:
         ("Gone", "vector", r"Gone cannot be made \(.*check the spelling.*PYTHONPATH"),
     ],
 )
-def test_modules_that_break_the_contract(backbone: str, output: Any, said: str) -> None:
-    with pytest.raises(ConfigError, match=said):
+def test_modules_that_return_wrong_shapes(backbone: str, output: Any, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         CNN(f"{HERE}.{backbone}", output=output).extract([bands()])
 
 
@@ -246,7 +246,7 @@ def test_settings_key_the_cache(tmp_path: Path) -> None:
     assert CNN().settings == CNN(size=224).settings
 
 
-def test_settings_know_a_file_by_its_content(tmp_path: Path) -> None:
+def test_settings_hold_a_digest_of_a_weights_file(tmp_path: Path) -> None:
     files = [tmp_path / name for name in ("a.pth", "moved.pth", "other.pth")]
     for file, content in zip(files, (b"same", b"same", b"else"), strict=True):
         file.write_bytes(content)
@@ -268,8 +268,12 @@ def test_cached_map(tmp_path: Path) -> None:
 def test_extractors_can_be_described_copied_and_pickled() -> None:
     extractor = CNN(f"{HERE}.Pixels", output="map", size=32, crop="whole")
     expected = features(extractor, bands())
-    for other in (build(describe(extractor)), copy.deepcopy(extractor), pickle.loads(pickle.dumps(extractor))):
-        assert describe(other) == describe(extractor)
+    for other in (
+        build_object(describe_object(extractor)),
+        copy.deepcopy(extractor),
+        pickle.loads(pickle.dumps(extractor)),
+    ):
+        assert describe_object(other) == describe_object(extractor)
         np.testing.assert_array_equal(features(other, bands()), expected)
 
 
@@ -282,7 +286,7 @@ def test_images_of_another_kind(image: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         ({"backbone": "resnet51"}, "backbone 'resnet51' is not known; give one of .*resnet50, vgg16"),
         ({"output": "pooled"}, "output is 'pooled'; give one of vector, map"),
@@ -292,8 +296,8 @@ def test_images_of_another_kind(image: np.ndarray) -> None:
         ({"backbone": "my.Net", "weights": "none"}, "weights are 'none', but the constructor of my.Net"),
     ],
 )
-def test_settings_that_do_not_exist(options: dict[str, Any], said: str) -> None:
-    with pytest.raises(ConfigError, match=said):
+def test_settings_that_do_not_exist(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         CNN(**options)
 
 

@@ -1,4 +1,4 @@
-"""Matching of descriptors: known pairs, which are mutual and clear, in known order."""
+"""Matching of descriptors: known pairs of mutual nearest neighbours, in known order."""
 
 from __future__ import annotations
 

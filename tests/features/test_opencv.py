@@ -1,4 +1,4 @@
-"""Tests of OpenCV's features behind the extractor contract, all four alike."""
+"""Tests of the extractors of OpenCV's four kinds of features."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def test_bits_keep_hamming_distance(kind: type[LocalExtractor]) -> None:
 def test_sift_is_opencv_s() -> None:
     image = texture()
     (record,) = SIFT().extract([image])
-    keypoints, descriptors = cv2.SIFT.create().detectAndCompute(image, None)  # pyright: ignore[reportCallIssue, reportArgumentType]
+    keypoints, descriptors = cv2.SIFT.create().detectAndCompute(image, None)
     strongest = max(range(len(keypoints)), key=lambda i: keypoints[i].response)
     np.testing.assert_allclose(record["keypoints"][0, :2], keypoints[strongest].pt)
     np.testing.assert_allclose(

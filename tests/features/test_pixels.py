@@ -1,4 +1,4 @@
-"""Tests of the images themselves as features: their size, their place, what retrieval compares."""
+"""Tests of images themselves as features: their size, which part is kept, what retrieval compares."""
 
 from __future__ import annotations
 

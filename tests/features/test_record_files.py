@@ -1,4 +1,4 @@
-"""Tests of the record files: whole, or known to be damaged."""
+"""Tests of record files: read whole, or reported as damaged."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 from lightning_pose.errors import CacheError
 from lightning_pose.features.base import Record
-from lightning_pose.features.record_files import DamagedError, read_record, write_record, write_whole
+from lightning_pose.features.record_files import DamagedError, read_record, write_file_atomically, write_record
 
 RECORD = {
     "descriptors": np.arange(6, dtype=np.float32).reshape(2, 3).T,  # not contiguous, as a slice may be
@@ -68,7 +68,7 @@ def test_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(Path, "write_bytes", full)
     with pytest.raises(CacheError, match=r"No space left on device.*free some space, or set LIGHTNING_POSE"):
-        write_whole(tmp_path / "x", b"data")
+        write_file_atomically(tmp_path / "x", b"data")
     assert list(tmp_path.iterdir()) == []
 
 

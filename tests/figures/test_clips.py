@@ -16,8 +16,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.text import Text
 
-from lightning_pose.figures.clips import CLIP_BASELINES, error_by_length, relative_trajectories, responses
-from lightning_pose.figures.style import MODEL, TRUTH
+from lightning_pose.figures.clips import (
+    draw_error_by_length,
+    draw_relative_trajectories,
+    draw_responses,
+)
+from lightning_pose.figures.style import CLIP_BASELINES, MODEL, TRUTH
 
 RNG = np.random.default_rng(0)
 PATH = np.stack([np.linspace(0, 4, 60), np.linspace(0, 0.1, 60), np.sin(np.linspace(0, 3, 60))], axis=1)
@@ -78,7 +82,7 @@ def test_clip_plots_leave_pyplot_alone() -> None:
 def test_each_sequence_has_a_panel_with_its_two_longest_axes_at_one_scale() -> None:
     truth = {"heads/seq-01": PATH, "chess/seq-02": PATH[:, [1, 0, 2]]}
     prediction = {name: path + 0.1 for name, path in truth.items()}
-    figure = draw(relative_trajectories(truth, prediction, unit="scene", errors={"heads/seq-01": 0.12345}))
+    figure = draw(draw_relative_trajectories(truth, prediction, unit="scene", errors={"heads/seq-01": 0.12345}))
     first, second = figure.axes
     assert (first.get_xlabel(), first.get_ylabel()) == ("x (scene)", "z (scene)")
     assert (second.get_xlabel(), second.get_ylabel()) == ("y (scene)", "z (scene)")
@@ -90,7 +94,7 @@ def test_each_sequence_has_a_panel_with_its_two_longest_axes_at_one_scale() -> N
 
 
 def test_truth_is_black_prediction_blue_and_the_start_a_dot() -> None:
-    truth, prediction, start = draw(relative_trajectories({"a": PATH}, {"a": PATH * 1.2})).axes[0].get_lines()
+    truth, prediction, start = draw(draw_relative_trajectories({"a": PATH}, {"a": PATH * 1.2})).axes[0].get_lines()
     assert (truth.get_color(), prediction.get_color(), start.get_color()) == (TRUTH, MODEL, TRUTH)
     np.testing.assert_allclose(points(prediction), 1.2 * PATH[:, [0, 2]])
     np.testing.assert_allclose(points(start), PATH[:1, [0, 2]])
@@ -100,23 +104,23 @@ def test_truth_is_black_prediction_blue_and_the_start_a_dot() -> None:
 def test_a_prediction_that_strays_does_not_shrink_the_truth() -> None:
     far = PATH.copy()
     far[30:] *= 1000
-    axes = draw(relative_trajectories({"a": PATH}, {"a": far})).axes[0]
+    axes = draw(draw_relative_trajectories({"a": PATH}, {"a": far})).axes[0]
     assert 4 <= np.ptp(axes.get_xlim()) < 14
-    axes = draw(relative_trajectories({"still": 0 * PATH}, {"still": 100 * PATH})).axes[0]
+    axes = draw(draw_relative_trajectories({"still": 0 * PATH}, {"still": 100 * PATH})).axes[0]
     assert 400 <= np.ptp(axes.get_xlim()) < 500
 
 
 def test_nine_sequences_of_more_are_drawn() -> None:
     paths = {f"seq-{i:02d}": PATH for i in range(12)}
-    figure = draw(relative_trajectories(paths, paths, title="Kitchen"))
+    figure = draw(draw_relative_trajectories(paths, paths, title="Kitchen"))
     assert len(figure.axes) == 9
     assert figure.get_suptitle() == "Kitchen (9 of 12)"
     five = dict(itertools.islice(paths.items(), 5))
-    assert len(draw(relative_trajectories(five, paths)).axes) == 5
+    assert len(draw(draw_relative_trajectories(five, paths)).axes) == 5
 
 
 def test_error_by_length_has_a_line_a_system_in_its_own_colour() -> None:
-    figure = draw(error_by_length(LENGTHS, ERRORS, unit="scene"))
+    figure = draw(draw_error_by_length(LENGTHS, ERRORS, unit="scene"))
     position, orientation = figure.axes
     own = colors(position)
     assert own == colors(orientation)
@@ -144,7 +148,7 @@ def test_error_by_length_has_a_line_a_system_in_its_own_colour() -> None:
 
 def test_responses_have_a_row_a_layer_without_ticks() -> None:
     image = RNG.integers(0, 255, (30, 40, 3), dtype=np.uint8)
-    figure = draw(responses([image, image[..., 0]], MAPS))
+    figure = draw(draw_responses([image, image[..., 0]], MAPS))
     shown = [axes for axes in figure.axes if axes.images]
     assert len(shown) == 2 + 3 + 8
     assert [axes.get_ylabel() for axes in figure.axes[::8]] == ["input", "convolution 1", "activation 1"]
@@ -152,26 +156,28 @@ def test_responses_have_a_row_a_layer_without_ticks() -> None:
     assert {axes.images[0].get_cmap().name for axes in shown} == {"gray"}
     assert shown[1].images[0].get_clim() == (0, 255)
     assert shown[2].images[0].get_clim() == (MAPS["convolution 1"][0].min(), MAPS["convolution 1"][0].max())
-    assert [axes.get_ylabel() for axes in draw(responses([], MAPS)).axes[::8]] == ["convolution 1", "activation 1"]
+    assert [axes.get_ylabel() for axes in draw(draw_responses([], MAPS)).axes[::8]] == ["convolution 1", "activation 1"]
 
 
 @pytest.mark.parametrize(
     "make",
     [
         pytest.param(
-            lambda: relative_trajectories(
+            lambda: draw_relative_trajectories(
                 paths := {f"a_long_name/of_a_sequence-{i:02d}": PATH * 10.0 ** (i / 2 - 2) for i in range(9)},
                 paths,
                 errors=dict.fromkeys(paths, 0.00012345),
             ),
             id="trajectories",
         ),
-        pytest.param(lambda: relative_trajectories({"a": PATH}, {"a": PATH}, errors={"a": 1.0}), id="a trajectory"),
-        pytest.param(lambda: error_by_length(LENGTHS, ERRORS), id="lengths"),
         pytest.param(
-            lambda: error_by_length(np.arange(2, 401), {"CNN3D": (np.ones(399), np.ones(399))}), id="all lengths"
+            lambda: draw_relative_trajectories({"a": PATH}, {"a": PATH}, errors={"a": 1.0}), id="a trajectory"
         ),
-        pytest.param(lambda: responses([np.zeros((300, 64))] * 5, MAPS), id="responses"),
+        pytest.param(lambda: draw_error_by_length(LENGTHS, ERRORS), id="lengths"),
+        pytest.param(
+            lambda: draw_error_by_length(np.arange(2, 401), {"CNN3D": (np.ones(399), np.ones(399))}), id="all lengths"
+        ),
+        pytest.param(lambda: draw_responses([np.zeros((300, 64))] * 5, MAPS), id="responses"),
     ],
 )
 def test_no_two_texts_overlap_or_leave_the_figure(make: Callable[[], Figure]) -> None:
@@ -189,21 +195,23 @@ def test_no_two_texts_overlap_or_leave_the_figure(make: Callable[[], Figure]) ->
 @pytest.mark.parametrize(
     "make",
     [
-        pytest.param(lambda: relative_trajectories({}, {}), id="no sequence"),
-        pytest.param(lambda: relative_trajectories({"a": PATH[:1]}, {"a": PATH[:1]}), id="one frame"),
-        pytest.param(lambda: relative_trajectories({"a": 0 * PATH}, {"a": PATH}), id="no motion"),
-        pytest.param(lambda: relative_trajectories({"a": PATH}, {"a": np.nan * PATH}), id="prediction NaN"),
+        pytest.param(lambda: draw_relative_trajectories({}, {}), id="no sequence"),
+        pytest.param(lambda: draw_relative_trajectories({"a": PATH[:1]}, {"a": PATH[:1]}), id="one frame"),
+        pytest.param(lambda: draw_relative_trajectories({"a": 0 * PATH}, {"a": PATH}), id="no motion"),
+        pytest.param(lambda: draw_relative_trajectories({"a": PATH}, {"a": np.nan * PATH}), id="prediction NaN"),
         pytest.param(
-            lambda: relative_trajectories({"a": PATH}, {"a": PATH}, errors={"a": np.inf}), id="error infinite"
+            lambda: draw_relative_trajectories({"a": PATH}, {"a": PATH}, errors={"a": np.inf}), id="error infinite"
         ),
-        pytest.param(lambda: error_by_length(LENGTHS, {}), id="no system"),
-        pytest.param(lambda: error_by_length([50], {"a": ([0.0], [np.nan])}), id="one length, zero and NaN"),
-        pytest.param(lambda: error_by_length([], {"a": ([], [])}), id="no length"),
-        pytest.param(lambda: responses([], {}), id="no layer"),
+        pytest.param(lambda: draw_error_by_length(LENGTHS, {}), id="no system"),
+        pytest.param(lambda: draw_error_by_length([50], {"a": ([0.0], [np.nan])}), id="one length, zero and NaN"),
+        pytest.param(lambda: draw_error_by_length([], {"a": ([], [])}), id="no length"),
+        pytest.param(lambda: draw_responses([], {}), id="no layer"),
         pytest.param(
-            lambda: responses([], {"a": [np.zeros((4, 4)), np.full((4, 4), np.nan)], "b": []}), id="dead filter"
+            lambda: draw_responses([], {"a": [np.zeros((4, 4)), np.full((4, 4), np.nan)], "b": []}), id="dead filter"
         ),
-        pytest.param(lambda: responses([], {"a": [np.ones((1, 500))], "b": [np.ones((500, 1))]}), id="far from square"),
+        pytest.param(
+            lambda: draw_responses([], {"a": [np.ones((1, 500))], "b": [np.ones((500, 1))]}), id="far from square"
+        ),
     ],
 )
 @pytest.mark.filterwarnings("error")

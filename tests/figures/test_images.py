@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from lightning_pose.figures.images import cumulative_errors, error_vs_distance, trajectory
+from lightning_pose.figures.images import draw_cumulative_errors, draw_error_vs_distance, draw_trajectory
 from lightning_pose.figures.style import Errors
 
 RNG = np.random.default_rng(0)
@@ -40,13 +40,13 @@ def test_plots_leave_pyplot_alone() -> None:
 
 
 def test_trajectory_shows_the_two_longest_axes_at_one_scale() -> None:
-    axes = draw(trajectory(PATH, PATH + 0.05, title="a room")).axes[0]
+    axes = draw(draw_trajectory(PATH, PATH + 0.05, title="a room")).axes[0]
     assert (axes.get_xlabel(), axes.get_ylabel(), axes.get_title(loc="left")) == ("x (m)", "z (m)", "a room")
     assert axes.get_aspect() == 1
 
 
 def test_trajectory_has_one_line_per_sequence_and_one_legend_entry_for_all() -> None:
-    figure = draw(trajectory(PATH, PATH, ["seq-01"] * 20 + ["seq-02"] * 40, PATH + 1, unit="scene"))
+    figure = draw(draw_trajectory(PATH, PATH, ["seq-01"] * 20 + ["seq-02"] * 40, PATH + 1, unit="scene"))
     lines = [line for line in figure.axes[0].get_lines() if line.get_label() == "truth"]
     assert [len(np.asarray(line.get_xdata())) for line in lines] == [20, 40]
     assert legend(figure) == ["training frames", "truth", "prediction"]
@@ -56,13 +56,13 @@ def test_trajectory_has_one_line_per_sequence_and_one_legend_entry_for_all() -> 
 def test_trajectory_counts_what_lies_outside() -> None:
     prediction = PATH.copy()
     prediction[3], prediction[9] = 1000, np.nan
-    figure = draw(trajectory(PATH, prediction))
+    figure = draw(draw_trajectory(PATH, prediction))
     assert legend(figure) == ["truth", "prediction (2 outside)"]
     assert figure.axes[0].get_xlim()[1] < 10
 
 
 def test_cumulative_errors_ranks_by_median() -> None:
-    figure = draw(cumulative_errors(ERRORS, {"retrieval_top1": WORSE, "no_motion": WORSE}, name="SurfLSTM"))
+    figure = draw(draw_cumulative_errors(ERRORS, {"retrieval_top1": WORSE, "no_motion": WORSE}, name="SurfLSTM"))
     median = np.median(np.asarray(ERRORS[0]))
     assert legend(figure, 0)[0] == f"SurfLSTM  {median:.3g} m"
     assert [entry.split()[0] for entry in legend(figure, 1)] == ["SurfLSTM", "retrieval_top1", "no_motion"]
@@ -72,7 +72,7 @@ def test_cumulative_errors_ranks_by_median() -> None:
 def test_cumulative_curves_rise_to_the_share_that_is_finite() -> None:
     position, orientation = (np.array(errors) for errors in ERRORS)
     position[:15] = np.nan
-    curve = draw(cumulative_errors((position, orientation), {})).axes[0].get_lines()[0]
+    curve = draw(draw_cumulative_errors((position, orientation), {})).axes[0].get_lines()[0]
     x, y = np.asarray(curve.get_xdata()), np.asarray(curve.get_ydata())
     assert all(a <= b for a, b in pairwise(y))
     assert y[x <= np.nanmax(position)].max() == pytest.approx(0.75)
@@ -80,7 +80,7 @@ def test_cumulative_curves_rise_to_the_share_that_is_finite() -> None:
 
 def test_error_vs_distance_joins_the_medians_of_tenths() -> None:
     distance = np.arange(1.0, 41)
-    axes = draw(error_vs_distance(2 * distance, distance)).axes[0]
+    axes = draw(draw_error_vs_distance(2 * distance, distance)).axes[0]
     medians = axes.get_lines()[2]
     np.testing.assert_allclose(np.asarray(medians.get_xdata()), np.arange(2.5, 41, 4))
     np.testing.assert_allclose(np.asarray(medians.get_ydata()), 2 * np.arange(2.5, 41, 4))
@@ -89,12 +89,14 @@ def test_error_vs_distance_joins_the_medians_of_tenths() -> None:
 @pytest.mark.parametrize(
     "make",
     [
-        pytest.param(lambda: trajectory(PATH[:1], PATH[:1]), id="one frame"),
-        pytest.param(lambda: trajectory(PATH, np.full_like(PATH, np.nan)), id="all predictions NaN"),
-        pytest.param(lambda: cumulative_errors((np.zeros(3), np.zeros(3)), {}), id="no error at all"),
-        pytest.param(lambda: cumulative_errors((np.full(3, np.nan), np.ones(3)), {"oracle": ERRORS}), id="model NaN"),
-        pytest.param(lambda: error_vs_distance(np.ones(3), np.zeros(3)), id="test frames among the training"),
-        pytest.param(lambda: error_vs_distance(np.full(3, np.nan), np.ones(3)), id="errors NaN"),
+        pytest.param(lambda: draw_trajectory(PATH[:1], PATH[:1]), id="one frame"),
+        pytest.param(lambda: draw_trajectory(PATH, np.full_like(PATH, np.nan)), id="all predictions NaN"),
+        pytest.param(lambda: draw_cumulative_errors((np.zeros(3), np.zeros(3)), {}), id="no error at all"),
+        pytest.param(
+            lambda: draw_cumulative_errors((np.full(3, np.nan), np.ones(3)), {"oracle": ERRORS}), id="model NaN"
+        ),
+        pytest.param(lambda: draw_error_vs_distance(np.ones(3), np.zeros(3)), id="test frames among the training"),
+        pytest.param(lambda: draw_error_vs_distance(np.full(3, np.nan), np.ones(3)), id="errors NaN"),
     ],
 )
 @pytest.mark.filterwarnings("error")

@@ -105,7 +105,7 @@ def test_align_hemisphere_flips_only_the_far_side() -> None:
     torch.testing.assert_close(align_hemisphere(quat, IDENTITY), about_z(10).expand(2, 4))
 
 
-def test_mean_quat_is_halfway_and_blind_to_signs() -> None:
+def test_mean_quat_is_halfway_whatever_the_signs() -> None:
     pair = torch.stack([about_z(0), about_z(40)])
     torch.testing.assert_close(mean_quat(pair), about_z(20))
     flipped = mean_quat(pair * torch.tensor([[1.0], [-1.0]], dtype=torch.float64))
@@ -126,7 +126,7 @@ def test_mean_quat_agrees_with_scipy() -> None:
 
 
 @pytest.mark.parametrize("degrees", [0.0, 1e-3, 0.03, 1.0, 90.0, 179.99, 180.0])
-def test_orientation_error_is_sound_in_float32(degrees: float) -> None:
+def test_orientation_error_is_accurate_in_float32(degrees: float) -> None:
     error = orientation_error_deg(about_z(0, torch.float32), -about_z(degrees, torch.float32))
     assert error.item() == pytest.approx(degrees, rel=1e-4, abs=1e-5)
 

@@ -75,17 +75,17 @@ def test_world_axes_are_equation_6_1() -> None:
 def test_a_chain_of_true_clips_is_the_trajectory(frame: RelativeFrame, length: int, hop: int) -> None:
     position_m, quat_wxyz = walk(12)
     chain = Chain(frame, position_m[0], quat_wxyz[0])
-    told: list[int] = []
+    added: list[int] = []
     for start in range(0, 12 - 1, hop):
         rows = list(range(start, min(start + length, 12)))
-        told += chain.add(rows, *relative_poses(position_m[rows], quat_wxyz[rows], frame))
+        added += chain.add(rows, *relative_poses(position_m[rows], quat_wxyz[rows], frame))
     numbers, chained_position, chained_quat = chain.trajectory()
-    assert told == numbers == list(range(12))
+    assert added == numbers == list(range(12))
     torch.testing.assert_close(chained_position, position_m)
     assert orientation_error_deg(chained_quat, quat_wxyz).max() < 1e-5
 
 
-def test_a_chain_begins_at_the_origin_and_keeps_what_it_has_said() -> None:
+def test_a_chain_begins_at_the_origin_and_keeps_poses_it_has_returned() -> None:
     position_m, quat_wxyz = relative_poses(*walk(3))
     chain = Chain()
     assert chain.add([10, 11, 12], position_m, quat_wxyz) == [10, 11, 12]

@@ -1,4 +1,4 @@
-"""The motion between two views of points whose places are known."""
+"""The motion between two views of points at known positions."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lightning_pose.geometry.quaternions import orientation_error_deg, quat_normalize
 from lightning_pose.geometry.relative import Chain, RelativeFrame, relative_poses
-from lightning_pose.localization.sequences import locate_sequence, windows
+from lightning_pose.localization.sequences import cut_windows, locate_sequence
 from lightning_pose.models.base import Pose
 
 
@@ -40,7 +40,7 @@ def walk(count: int) -> tuple[Tensor, Tensor]:
      (1, 4, [(0, 1)])],
 )  # fmt: skip
 def test_windows_share_a_frame(frames: int, length: int, expected: list[tuple[int, int]]) -> None:
-    assert [(window.start, window.stop) for window in windows(frames, length)] == expected
+    assert [(window.start, window.stop) for window in cut_windows(frames, length)] == expected
 
 
 @pytest.mark.parametrize("frame", ["camera", "world"])

@@ -42,12 +42,13 @@ def test_batches_clips_and_one_go_agree() -> None:
 
 
 def test_gathered_state_is_a_tensor() -> None:
-    metrics = PoseMetrics()
-    metrics.update(*poses(4), *poses(4, seed=1))
-    expected = metrics.compute()
-    metrics.position_error_m = torch.cat(metrics.position_error_m)  # pyright: ignore[reportAttributeAccessIssue]
-    metrics._computed = None
-    assert metrics.compute() == expected
+    alone, gathered = PoseMetrics(), PoseMetrics()
+    gathered.dist_sync_fn = lambda state, group: [state]  # all that one process gathers
+    gathered.distributed_available_fn = lambda: True
+    for metrics in (alone, gathered):
+        metrics.update(*poses(4), *poses(4, seed=1))
+        metrics.update(*poses(3, seed=2), *poses(3, seed=3))
+    assert gathered.compute() == alone.compute()
 
 
 def test_half_precision_predictions_keep_the_truth_exact() -> None:

@@ -1,4 +1,4 @@
-"""Trajectory errors: known offsets, scales and turns, a plain numpy computation, and sequences too poor to measure."""
+"""Trajectory errors: known offsets, scales and turns, a plain numpy computation, and sequences that are too short."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Poses = tuple[np.ndarray, np.ndarray]
 
 
 def walk(n: int = 40, seed: int = 0) -> Poses:
-    """A smooth wandering in all directions: positions (n, 3), quaternions (n, 4)."""
+    """A smooth path in all directions: positions (n, 3), quaternions (n, 4)."""
     rng = np.random.default_rng(seed)
     turns = Rotation.from_rotvec(np.cumsum(rng.normal(0, 0.05, (n, 3)), axis=0))
     return np.cumsum(rng.normal(0.02, 0.05, (n, 3)), axis=0), turns.as_quat(scalar_first=True)
@@ -149,11 +149,11 @@ def test_standing_still_has_the_spread_of_the_truth_and_a_mirror_is_no_rotation(
 
 
 @pytest.mark.parametrize("n", [0, 1, 2])
-def test_too_few_poses_tell_nothing(n: int) -> None:
+def test_too_few_poses_give_nan(n: int) -> None:
     truth, hat = walk(n), noisy(walk(n))
     errors = trajectory_errors(*hat, *truth)
-    told = {name for name, value in errors.items() if not math.isnan(value)}
-    assert told == (set(errors) - {"ate_rmse_m"} if n == 2 else set())
+    measured = {name for name, value in errors.items() if not math.isnan(value)}
+    assert measured == (set(errors) - {"ate_rmse_m"} if n == 2 else set())
 
 
 def test_a_lost_prediction_is_infinitely_wrong() -> None:
@@ -190,7 +190,7 @@ def test_each_sequence_counts_once_in_the_mean() -> None:
     assert mean_over_sequences({}) == {}
 
 
-def test_drift_grows_with_length_by_what_each_step_errs() -> None:
+def test_drift_grows_with_length_by_the_error_of_each_step() -> None:
     drift = drift_by_length(*straight(21, 0.11, 1.5), *straight(21, 0.10, 1.0), [1, 5, 20, 21])
     assert_allclose(drift.lengths, [1, 5, 20, 21])
     assert_allclose(drift.position_m, [0.01, 0.05, 0.2, math.nan])
@@ -228,7 +228,7 @@ def test_percent_is_over_what_moved() -> None:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_errors_are_those_of_evo(seed: int) -> None:
-    """evo is GPL-3: a peer in tests, never imported by the package."""
+    """evo is GPL-3: tests compare with it, and the package never imports it."""
     truth = walk(n=30 + seed, seed=seed)
     hat = moved(noisy(truth, seed + 10), Rotation.from_rotvec([0.3, -0.5, 1.0]), [3.0, -2.0, 7.0])
     reference, shape, anchored = (PosePath3D(*poses) for poses in (truth, hat, hat))

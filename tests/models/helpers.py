@@ -6,14 +6,15 @@ import math
 
 import numpy as np
 import torch
-from lightning import LightningDataModule
 from torch import nn
 from torch.utils.data import DataLoader
 
 from lightning_pose import models
-from lightning_pose.data.batches import PoseBatch, PoseDataset, batch_loader
+from lightning_pose.data import ClipDataModule, SceneDataModule
+from lightning_pose.data.batches import PoseBatch, PoseDataset, make_loader
 from lightning_pose.data.clip_dataset import ClipDataset, ClipShape
 from lightning_pose.models import PoseModule
+from tests.helpers import Thumbnails
 
 __all__ = [
     "ARCHITECTURES",
@@ -50,7 +51,7 @@ def make_model(architecture: type[PoseModule], **settings: object) -> PoseModule
         small = {"input_shape": _INPUT_SHAPES[architecture.input_ranks[0]]}
     model = architecture(**{**small, **settings})  # type: ignore[arg-type]
     if isinstance(model, models.NodePose):
-        model.remember(LearnableProblem(list(model.input_shape)).data.data)
+        model.store_training(LearnableProblem(list(model.input_shape)).data.data)
     return model
 
 
@@ -78,16 +79,16 @@ def random_poses(count: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]
 
 def features_for(model: PoseModule, count: int, seed: int = 0) -> torch.Tensor:
     """Random features of frames, or of clips where the model reads those."""
-    axes = (CLIP_LENGTH,) if isinstance(model, models.ClipModule) else ()
+    axes = (CLIP_LENGTH,) if model.reads_clips else ()
     return torch.randn(count, *axes, *model.input_shape, generator=torch.Generator().manual_seed(seed))
 
 
 def problem_for(model: PoseModule) -> LearnableProblem:
     """A problem that the model can learn, of clips where it reads those."""
-    return (ClipProblem if isinstance(model, models.ClipModule) else LearnableProblem)(list(model.input_shape))
+    return (ClipProblem if model.reads_clips else LearnableProblem)(list(model.input_shape))
 
 
-class LearnableProblem(LightningDataModule):
+class LearnableProblem(SceneDataModule):
     """Frames whose features are the pose times a fixed random matrix, so that there is all to learn and no noise.
 
     Validation and test frames follow the same rule, and no frame is in two splits: what is learnt from one split
@@ -95,7 +96,7 @@ class LearnableProblem(LightningDataModule):
     """
 
     def __init__(self, input_shape: list[int], count: int = 24) -> None:
-        super().__init__()
+        SceneDataModule.__init__(self, Thumbnails(), 8, 8, cache_dir=None, workers=None)  # the extractor is not used
         poses = {split: random_poses(count, seed) for split, seed in _SEEDS.items()}
         train = torch.cat(poses["train"], dim=-1)
         mix = torch.randn(7, math.prod(input_shape), generator=torch.Generator().manual_seed(1)) / 7**0.5
@@ -108,28 +109,33 @@ class LearnableProblem(LightningDataModule):
         self.data = self.splits["train"]
         self.learnt = self.data.data
 
+    def prepare_data(self) -> None:
+        """There is nothing to extract."""
+
     def dataset(self, split: str) -> PoseDataset:
         return self.splits[split]
 
     def train_dataloader(self) -> DataLoader[PoseBatch]:
-        return batch_loader(self.data, batch_size=8, shuffle=True)
+        return make_loader(self.data, batch_size=8, shuffle=True)
+
+    def val_dataloader(self) -> DataLoader[PoseBatch] | list[DataLoader[PoseBatch]]:
+        """None, unless a subclass has one: most tests need no validation."""
+        return []
 
 
-class ClipProblem(LearnableProblem):
+class ClipProblem(LearnableProblem, ClipDataModule):
     """Clips in which every frame shows where it is."""
-
-    gives_clips = True
-    relative_frame = "camera"
 
     def __init__(self, input_shape: list[int], count: int = 24) -> None:
         super().__init__(input_shape, count)
+        self.relative_frame = "camera"
         shape = ClipShape(CLIP_LENGTH, hop=1)
         self.clip_splits = {
             split: ClipDataset(frames.data, [np.arange(count)], shape) for split, frames in self.splits.items()
         }
-        self.clips = self.clip_splits["train"]
-        # What a frame shows is its pose relative to the first frame of its clip, as it is to be told.
-        _, position_m, quat_wxyz, frame = self.clips.__getitems__(range(len(self.clips)))
+        self.training_clips = self.clip_splits["train"]
+        # A frame shows its pose relative to the first frame of its clip, which is the target.
+        _, position_m, quat_wxyz, frame = self.training_clips.__getitems__(range(len(self.training_clips)))
         rows, columns = input_shape
         # In patches, because the networks' pools are averages.
         mix = torch.randn(7, -(-rows // 5), -(-columns // 5), generator=torch.Generator().manual_seed(1))
@@ -137,8 +143,8 @@ class ClipProblem(LearnableProblem):
         features = torch.einsum("wtp,prc->wtrc", torch.cat([position_m, quat_wxyz], dim=-1), mix)
         self.learnt = PoseBatch(features, position_m, quat_wxyz, frame)
 
-    def dataset(self, split: str) -> ClipDataset:  # type: ignore[override]
+    def dataset(self, split: str) -> ClipDataset:
         return self.clip_splits[split]
 
     def train_dataloader(self) -> DataLoader[PoseBatch]:
-        return batch_loader(PoseDataset(self.learnt), batch_size=8, shuffle=True)
+        return make_loader(PoseDataset(self.learnt), batch_size=8, shuffle=True)

@@ -10,8 +10,8 @@ import pytest
 import torch
 from lightning import Trainer
 
-from lightning_pose.checkpoint import build
-from lightning_pose.data.batches import PoseBatch, batch_loader
+from lightning_pose.checkpoint import build_object
+from lightning_pose.data.batches import PoseBatch, make_loader
 from lightning_pose.errors import ConfigError
 from lightning_pose.geometry.quaternions import orientation_error_deg, position_error_m
 from lightning_pose.losses import LossConfig
@@ -85,7 +85,7 @@ def test_a_checkpoint_rebuilds_the_same_model(architecture: Architecture) -> Non
     torch.save({"spec": model.describe(), "state_dict": model.state_dict()}, file)
     file.seek(0)
     saved: dict[str, Any] = torch.load(file, weights_only=True)  # plain types only, or this refuses
-    rebuilt: PoseModule = build(saved["spec"])
+    rebuilt: PoseModule = build_object(saved["spec"])
     rebuilt.load_state_dict(saved["state_dict"])
     assert type(rebuilt) is architecture
     assert rebuilt.learning_rate == 0.02
@@ -139,12 +139,12 @@ class NoTestSplit:
 
 class LearnableWithoutTest(NoTestSplit, LearnableProblem):
     def val_dataloader(self) -> Any:
-        return batch_loader(self.dataset("val"), batch_size=8, shuffle=False)
+        return make_loader(self.dataset("val"), batch_size=8, shuffle=False)
 
 
 class ClipsWithoutTest(NoTestSplit, ClipProblem):
     def val_dataloader(self) -> Any:
-        return batch_loader(self.dataset("val"), batch_size=8, shuffle=False)
+        return make_loader(self.dataset("val"), batch_size=8, shuffle=False)
 
 
 CLOSED_FORMS: list[tuple[Architecture, dict[str, Any]]] = [

@@ -82,7 +82,11 @@ def test_the_cosine_schedule_warms_up_and_ends_at_zero(monkeypatch: pytest.Monke
     model = tiny(learning_rate=1.0, schedule="cosine")
     monkeypatch.setattr(PoseModule, "trainer", type("Steps", (), {"estimated_stepping_batches": 100})())
     settings = model.configure_optimizers()
-    scheduler, optimizer = settings["lr_scheduler"]["scheduler"], settings["optimizer"]
+    assert isinstance(settings, dict)
+    optimizer, schedule = settings["optimizer"], settings["lr_scheduler"]
+    assert isinstance(schedule, dict)
+    scheduler = schedule["scheduler"]
+    assert isinstance(scheduler, torch.optim.lr_scheduler.LambdaLR)
     rates = []
     for _ in range(100):
         rates.append(scheduler.get_last_lr()[0])

@@ -10,10 +10,10 @@ from lightning import Trainer
 from torch import Tensor
 
 from lightning_pose.errors import ConfigError
-from lightning_pose.evaluation.responses import layer_responses
+from lightning_pose.evaluation.responses import record_responses
 from lightning_pose.geometry.relative import relative_poses
 from lightning_pose.models import CNN3D, CNNRNN, ClipModule
-from lightning_pose.models.parts.motion import matched_motion
+from lightning_pose.models.parts.motion import measure_motion
 from tests.models.helpers import ClipProblem, features_for
 
 NETWORKS: list[type[ClipModule]] = [CNNRNN, CNN3D]
@@ -64,7 +64,7 @@ def test_integrated_steps_begin_at_the_origin_and_add_up(network: type[ClipModul
     position_m, quat_wxyz = model(features)
     torch.testing.assert_close(position_m[:, 0], torch.zeros(1, 3))
     torch.testing.assert_close(quat_wxyz[:, 0], torch.eye(4)[:1])
-    steps, _ = model._unscaled(model.network(model._standardized(features).unsqueeze(2)))
+    steps, _ = model.unscale_pose(model.network(model.standardize_input(features).unsqueeze(2)))
     torch.testing.assert_close(position_m[:, 1], steps[:, 1])
 
 
@@ -72,7 +72,7 @@ def test_integrated_networks_learn_the_scale_of_steps_and_others_that_of_clips()
     problem = ClipProblem([6, 12])
     trainer = Trainer(accelerator="cpu", logger=False, enable_checkpointing=False)
     trainer.datamodule = problem  # type: ignore[attr-defined]
-    position_m, quat_wxyz = problem.clips.targets()
+    position_m, quat_wxyz = problem.training_clips.targets()
     for integrate in (False, True):
         model = make(CNNRNN, integrate=integrate)
         model.trainer = trainer
@@ -85,13 +85,13 @@ def test_integrated_networks_learn_the_scale_of_steps_and_others_that_of_clips()
 def test_metrics_leave_out_the_first_frame(monkeypatch: pytest.MonkeyPatch) -> None:
     problem, model = ClipProblem([6, 12]), make(CNN3D).eval()
     monkeypatch.setattr(model, "log_dict", lambda *args, **kwargs: None)
-    model._step(problem.learnt, "val")
+    model.validation_step(problem.learnt, 0)
     (errors,) = model.val_metrics.position_error_m
     assert len(errors) == problem.learnt.frame[:, 1:].numel()
 
 
 def test_motion_is_that_of_each_point() -> None:
-    rows = matched_motion(seen_points())
+    rows = measure_motion(seen_points())
     assert rows.shape == (1, 3, 6, 5)
     assert not rows[:, 0].any(), "the first frame has none before it"
     torch.testing.assert_close(rows[0, 1:, :, 2], torch.full((2, 6), 0.1))
@@ -103,7 +103,7 @@ def test_motion_is_that_of_each_point() -> None:
 def test_motion_does_not_depend_on_the_order_of_features() -> None:
     features = seen_points()
     mixed = torch.stack([frame[torch.randperm(6)] for frame in features[0]])[None]
-    torch.testing.assert_close(matched_motion(mixed), matched_motion(features))
+    torch.testing.assert_close(measure_motion(mixed), measure_motion(features))
 
 
 def test_features_without_a_match_do_not_move() -> None:
@@ -111,7 +111,7 @@ def test_features_without_a_match_do_not_move() -> None:
     features[0, 1, 2, :8] = torch.eye(8)[7]  # another point than any before
     features[0, 1, 3, :8] = 0  # a frame with fewer features
     features[0, 1, 4, 8] = 2.0  # a jump across the image is no motion
-    rows = matched_motion(features)
+    rows = measure_motion(features)
     assert (rows[0, 1].any(-1)).tolist() == [True] * 3 + [False] * 3
 
 
@@ -119,7 +119,7 @@ def test_motion_has_a_scale_of_its_own() -> None:
     problem = ClipProblem([6, 12])
     features = seen_points(24)[0]
     features[..., 8] -= features[..., 8].floor()  # whoever leaves to the right comes back
-    problem.clips.data.features.copy_(features)
+    problem.training_clips.data.features.copy_(features)
     model = make(CNN3D, motion=True)
     trainer = Trainer(accelerator="cpu", logger=False, enable_checkpointing=False)
     trainer.datamodule = problem  # type: ignore[attr-defined]
@@ -154,7 +154,7 @@ def test_a_causal_network_answers_before_the_next_frame_comes(model: ClipModule)
 
 
 @every_network
-def test_others_hear_later_frames(network: type[ClipModule]) -> None:
+def test_others_depend_on_later_frames(network: type[ClipModule]) -> None:
     model = make(network).eval()
     features = features_for(model, 1).repeat(1, 3, 1, 1)
     assert not torch.allclose(model(features[:, :7]).position_m[:, 6], model(features).position_m[:, 6], atol=1e-5)
@@ -163,7 +163,7 @@ def test_others_hear_later_frames(network: type[ClipModule]) -> None:
 @every_network
 def test_responses_of_the_first_two_layers(network: type[ClipModule]) -> None:
     model = make(network, [3, 32, 40]).train()
-    found = layer_responses(model, torch.rand(4, 3, 32, 40))
+    found = record_responses(model, torch.rand(4, 3, 32, 40))
     assert list(found) == ["convolution 1", "activation 1", "convolution 2", "activation 2"]
     assert found["convolution 1"].shape == found["activation 1"].shape == (4, 8, 32, 40)
     torch.testing.assert_close(found["activation 2"], found["convolution 2"].relu())

@@ -14,7 +14,7 @@ from sklearn.linear_model import Ridge
 from sklearn.pipeline import make_pipeline
 from torch.utils.data import DataLoader
 
-from lightning_pose.data.batches import PoseBatch, PoseDataset, batch_loader
+from lightning_pose.data.batches import PoseBatch, PoseDataset, make_loader
 from lightning_pose.errors import ConfigError
 from lightning_pose.geometry.quaternions import align_hemisphere
 from lightning_pose.losses import LossConfig
@@ -42,7 +42,7 @@ class NoisyProblem(LearnableProblem):
         self.data, self.held = self.splits["train"], self.splits["val"].data
 
     def val_dataloader(self) -> DataLoader[PoseBatch] | list[Any]:
-        return batch_loader(self.dataset("val"), batch_size=5, shuffle=False) if len(self.held.frame) else []
+        return make_loader(self.dataset("val"), batch_size=5, shuffle=False) if len(self.held.frame) else []
 
     def describe(self) -> dict[str, str]:
         return {"class_path": "noise"}
@@ -164,5 +164,5 @@ def test_a_frame_that_a_sampler_repeats_counts_once(monkeypatch: pytest.MonkeyPa
         monkeypatch.setattr(LinearPoseNet, "trainer", type("Two", (), {"world_size": 2, "global_rank": rank})())
         model.on_train_epoch_start()
         for rows in (slice(0, 3), slice(3, 4)):
-            model._add(PoseBatch(*(tensor[rows] for tensor in data)), frames=7)
-        assert model._moments.count == own
+            model.add_frames(PoseBatch(*(tensor[rows] for tensor in data)), frames=7)
+        assert model.moments.count == own

@@ -1,4 +1,4 @@
-"""NodePose: what queries hear, what they must not, the memory in its checkpoint, and its sizes."""
+"""NodePose: what queries receive, the memory in its checkpoint, and its sizes."""
 # pyright: reportCallIssue=false, reportAttributeAccessIssue=false, reportIndexIssue=false
 # (torch types what modules hold as Tensor or Module, which layers here are known not to be)
 
@@ -17,7 +17,7 @@ from lightning_pose.data.batches import PoseBatch
 from lightning_pose.errors import CheckpointError, ConfigError
 from lightning_pose.geometry.quaternions import align_hemisphere, orientation_error_deg
 from lightning_pose.models import NodePose
-from lightning_pose.models.parts.neighbour_graph import edge_index, search_neighbours
+from lightning_pose.models.parts.neighbour_graph import list_edges, search_neighbours
 from tests.models.helpers import LearnableProblem, random_poses
 
 WIDTH = 16
@@ -36,12 +36,12 @@ def make(count: int = 30, **settings: Any) -> NodePose:
     train = frames(count)
     model.fit_scale(train.position_m, train.quat_wxyz)
     model.fit_feature_scale(train.features)
-    model.remember(train)
+    model.store_training(train)
     return model.eval()
 
 
 def decode(model: NodePose, features: Tensor) -> Tensor:
-    return torch.cat(model._decode(features), dim=1)
+    return torch.cat(model.decode_features(features), dim=1)
 
 
 @pytest.mark.parametrize("neighbour_poses", [0, 2])
@@ -56,7 +56,7 @@ def test_an_answer_does_not_depend_on_the_batch(conv: str, neighbour_poses: int)
     torch.testing.assert_close(decode(model, queries.repeat(3, 1))[:9], together, atol=1e-5, rtol=1e-5)
 
 
-def test_queries_never_hear_each_other() -> None:
+def test_queries_never_affect_each_other() -> None:
     model = make(neighbour_poses=2)
     queries = frames(4, seed=1).features.requires_grad_()
     for row, pose in enumerate(decode(model, queries)):
@@ -75,7 +75,7 @@ def test_it_equals_pyg_on_the_joint_graph_of_training_images_and_queries(conv: s
             search_neighbours(*(torch.nn.functional.normalize(x, dim=1) for x in (queries, model.memory_features)), 3),
         ]
     )
-    state, edges = (nodes - model.feature_mean) / model.feature_scale, edge_index(table)
+    state, edges = (nodes - model.feature_mean) / model.feature_scale, list_edges(table)
     for convolution in model.network.convolutions:
         plain = layer(*(12, 8) if state.shape[1] == 12 else (state.shape[1], convolution.layer.out_channels))
         plain.load_state_dict(convolution.layer.state_dict())
@@ -86,16 +86,16 @@ def test_it_equals_pyg_on_the_joint_graph_of_training_images_and_queries(conv: s
 
 def test_training_sees_no_pose_but_the_target() -> None:
     model = make(neighbour_poses=2).train()
-    before = torch.cat(model._decode_batch(frames(30)), dim=1)
+    before = torch.cat(model.decode_batch(frames(30)), dim=1)
     model.memory_pose = torch.zeros_like(model.memory_pose)
-    torch.testing.assert_close(torch.cat(model._decode_batch(frames(30)), dim=1), before, atol=0, rtol=0)
+    torch.testing.assert_close(torch.cat(model.decode_batch(frames(30)), dim=1), before, atol=0, rtol=0)
 
 
 def test_the_nearest_neighbours_correct_the_answer() -> None:
     batch, queries = frames(30), frames(4, seed=1).features
     plain, model = make(neighbour_poses=0), make(neighbour_poses=2, slope=0.25)
     with torch.no_grad():
-        own, known = decode(plain, queries), torch.cat(plain.train()._decode_batch(batch), dim=1)
+        own, known = decode(plain, queries), torch.cat(plain.train().decode_batch(batch), dim=1)
     pose = torch.cat([batch.position_m, align_hemisphere(batch.quat_wxyz, model.quat_reference)], dim=1)
     keys = (torch.nn.functional.normalize(features, dim=1) for features in (queries, batch.features))
     nearest = search_neighbours(*keys, 2)
@@ -112,15 +112,15 @@ def test_a_slope_of_zero_is_retrieval() -> None:
 
 def test_a_sampled_graph_with_all_neighbours_is_the_full_graph() -> None:
     batch = PoseBatch(*(tensor[[3, 20, 11]] for tensor in frames(30)))
-    full = torch.cat(make().train()._decode_batch(batch), dim=1)
-    sampled = torch.cat(make(full_graph_limit=0).train()._decode_batch(batch), dim=1)
+    full = torch.cat(make().train().decode_batch(batch), dim=1)
+    sampled = torch.cat(make(full_graph_limit=0).train().decode_batch(batch), dim=1)
     torch.testing.assert_close(sampled, full, atol=1e-5, rtol=1e-5)
 
 
 def test_memory_is_in_the_order_of_frames() -> None:
     train = frames(30)
     model, shuffled = make(), make()
-    shuffled.remember(PoseBatch(*(tensor.flip(0) for tensor in train)))
+    shuffled.store_training(PoseBatch(*(tensor.flip(0) for tensor in train)))
     queries = frames(5, seed=1).features
     torch.testing.assert_close(decode(shuffled, queries), decode(model, queries))
     assert torch.equal(shuffled.memory_frame, torch.arange(30))
@@ -150,7 +150,7 @@ def test_answers_follow_the_weights() -> None:
     model = make()
     queries = frames(3, seed=1).features
     before = decode(model, queries).detach()
-    model.train()._decode_batch(frames(30))  # as a step would, after which Lightning sets `training` by itself
+    model.train().decode_batch(frames(30))  # as a step would, after which Lightning sets `training` by itself
     with torch.no_grad():
         model.network.convolutions[0].layer.lin_rel.weight.mul_(2)
     for module in model.modules():
@@ -188,7 +188,7 @@ def test_a_checkpoint_of_other_features_or_neighbours_is_refused() -> None:
 def test_fewer_training_images_than_neighbours_will_do() -> None:
     model = make(count=2, neighbours=5, neighbour_poses=2)
     assert decode(model, frames(3, seed=1).features).isfinite().all()
-    assert torch.cat(model.train()._decode_batch(frames(2)), dim=1).isfinite().all()
+    assert torch.cat(model.train().decode_batch(frames(2)), dim=1).isfinite().all()
 
 
 @pytest.mark.parametrize(("conv", "factor"), [("wl", 2), ("gcn", 1)])

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from lightning_pose.evaluation.responses import layer_responses
+from lightning_pose.evaluation.responses import record_responses
 from lightning_pose.models import CNN3D, CNNRNN, ClipModule
 
 
@@ -20,7 +20,7 @@ def averages(image: Tensor, width: int) -> Tensor:
 def test_the_second_convolution_reads_averages_of_the_first(network: type[ClipModule], width: int) -> None:
     torch.manual_seed(0)
     model = network(input_shape=[3, 20, 30], channels=4, units=8).eval()
-    found = layer_responses(model, torch.rand(3, 3, 20, 30))
+    found = record_responses(model, torch.rand(3, 3, 20, 30))
     first = found["activation 1"]  # batch normalisation, which is fresh, comes between in CNNRNN
     scale = (1 + 1e-5) ** -0.5 if network is CNNRNN else 1.0
     pooled = averages(first, width) * scale
@@ -40,7 +40,7 @@ def test_the_linear_layers_read_averages_of_the_second(network: type[ClipModule]
     seen: list[Tensor] = []
     reader = model.network.lstm if network is CNNRNN else model.network.head  # type: ignore[union-attr]
     reader.register_forward_pre_hook(lambda module, arguments: seen.append(arguments[0]))  # type: ignore[union-attr]
-    second = layer_responses(model, torch.rand(3, 3, 20, 30))["activation 2"]
+    second = record_responses(model, torch.rand(3, 3, 20, 30))["activation 2"]
     scale, window = ((1 + 1e-5) ** -0.5, 2) if network is CNNRNN else (1.0, 5)
     expected = averages(second, window).flatten(1) * scale
     torch.testing.assert_close(seen[0].flatten(0, 1), expected, atol=1e-5, rtol=1e-4)

@@ -10,7 +10,7 @@ import torch
 from lightning import Trainer
 from torch import Tensor, nn
 
-from lightning_pose.checkpoint import build
+from lightning_pose.checkpoint import build_object
 from lightning_pose.data.batches import PoseBatch
 from lightning_pose.errors import CheckpointError, ConfigError
 from lightning_pose.features.backbones import build_backbone
@@ -68,7 +68,7 @@ def test_it_is_trained_on_random_crops(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (rows.min(), rows.max()) == (0, 8)
     assert (columns.min(), columns.max()) == (0, 12)
     model.eval()
-    model._step(batch, "val")
+    model.validation_step(batch, 0)
     assert (model.network.cnn.crops[-1][:, 0, 0, 0] * 255 == 4).all()  # type: ignore[union-attr, index]
 
 
@@ -93,7 +93,7 @@ def attach(model: PoseNet, problem: LearnableProblem) -> PoseNet:
 def test_a_checkpoint_needs_the_pretrained_weights_no_more(tmp_path: Path) -> None:
     gone = str(tmp_path / "gone.pth")
     model = PoseNet(input_shape=[3, 32, 32], backbone="mobilenet_v2", crop=32, weights=gone)
-    rebuilt = build(model.describe())
+    rebuilt = build_object(model.describe())
     rebuilt.load_state_dict(model.state_dict())
     images = numbered_images(2, 32, 32)
     torch.testing.assert_close(rebuilt.eval()(images), model.eval()(images))
@@ -113,7 +113,7 @@ def test_a_module_that_comes_frozen_is_trained() -> None:
 def test_mixed_precision_leaves_poses_in_single_precision() -> None:
     model = make_model(PoseNet)
     with torch.autocast("cpu", torch.bfloat16):
-        pose = model.train()._decode(torch.rand(4, 3, 12, 12))[0]
+        pose = model.train().decode_features(torch.rand(4, 3, 12, 12))[0]
     assert pose.dtype == torch.float32
     assert (pose.bfloat16().float() != pose).any()
     trainer(precision="bf16-mixed").fit(model, datamodule=LearnableProblem([3, 12, 12]))

@@ -9,4 +9,4 @@ __all__ = ["shown"]
 
 def shown(report: Report) -> dict[str, dict[str, float]]:
     """Position errors by system and scene."""
-    return {row.system: {scene: cell.position_m for scene, cell in row.cells.items()} for row in report.rows}
+    return {row.system: {scene: cell.errors[0] for scene, cell in row.cells.items()} for row in report.rows}

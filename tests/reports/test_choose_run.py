@@ -18,7 +18,7 @@ def test_best_is_by_validation_and_never_by_test(table) -> None:
         FakeRun(test=(0.05, 1.0), val=math.nan, day=2),
     )
     (cell,) = report.rows[0].cells.values()
-    assert (cell.position_m, cell.candidates, len(cell.runs)) == (0.9, 3, 1)
+    assert (cell.errors[0], cell.candidates, len(cell.runs)) == (0.9, 3, 1)
     assert "best by val/position_median_m" in report.rule
     assert any("SurfLSTM on chess (1 of 3): runs without a validation metric" in note for note in report.notes)
 
@@ -36,7 +36,7 @@ def test_the_rule_tells_how_many_runs_know_only_their_last_epoch(table) -> None:
     runs = [FakeRun(metrics=known), FakeRun(val=0.2), FakeRun(scene="fire", val=0.3)]
     says = "the run that is best by val/position_median_m of its best epoch"
     assert table(*runs).rule == (
-        f"of each system and scene, {says} (of its last, for 2 of 3 runs that do not tell their best); "
+        f"of each system and scene, {says} (of its last, for 2 of 3 runs that do not record their best); "
         "never by test errors"
     )
     assert table(runs[0]).rule == f"of each system and scene, {says}; never by test errors"
@@ -66,15 +66,15 @@ def test_validation_on_different_frames_is_told(table) -> None:
 def test_spread_over_seeds(table) -> None:
     seeds = [FakeRun(test=(value, 10 * value), params={"seed": str(i)}) for i, value in enumerate((0.1, 0.2, 0.6))]
     (cell,) = table(*seeds, pick="spread").rows[0].cells.values()
-    assert (cell.position_m, cell.orientation_deg) == (pytest.approx(0.3), pytest.approx(3.0))
-    assert cell.position_std_m == pytest.approx(math.sqrt(0.07))  # (0.04 + 0.01 + 0.09) / 2
+    assert (cell.errors[0], cell.errors[1]) == (pytest.approx(0.3), pytest.approx(3.0))
+    assert cell.deviations[0] == pytest.approx(math.sqrt(0.07))  # (0.04 + 0.01 + 0.09) / 2
     assert len(cell.runs) == 3
 
 
 def test_spread_takes_the_newest_of_each_seed_and_no_test_runs(table) -> None:
     report = table(
-        FakeRun(test=(9.0, 1.0), params={"seed": "0"}, day=1),
-        FakeRun(test=(0.1, 1.0), params={"seed": "0", "data.workers": "4"}, day=2),
+        FakeRun(test=(9.0, 1.0), params={"seed": "0", "data.eval_batch_size": "64"}, day=1),
+        FakeRun(test=(0.1, 1.0), params={"seed": "0", "data.workers": "4", "data.eval_batch_size": "8"}, day=2),
         FakeRun(test=(0.3, 1.0), params={"seed": "1"}, day=2),
         FakeRun(test=(9.0, 1.0), params={"seed": "2"}, tags={"verb": "test"}, day=2),
         pick="spread",
@@ -89,7 +89,7 @@ def test_spread_counts_each_run_without_a_seed(table) -> None:
     runs = [FakeRun(test=(value, 1.0), params={"seed": "None"}) for value in (0.1, 0.2, 0.6)]
     report = table(*runs, pick="spread")
     (cell,) = report.rows[0].cells.values()
-    assert (len(cell.runs), cell.position_m) == (3, pytest.approx(0.3))
+    assert (len(cell.runs), cell.errors[0]) == (3, pytest.approx(0.3))
     assert not any("seeds" in note for note in report.notes)
 
 
@@ -116,5 +116,5 @@ def test_spread_refuses_runs_that_differ_in_more_than_the_seed(table) -> None:
     with pytest.raises(ConfigError, match=r"2 runs differ in model.units \(1, 2\), .* give --by model.units "):
         table(*runs, pick="spread")
     assert list(shown(table(*runs, pick="spread", by=("model.units",)))) == ["SurfLSTM (units=1)", "SurfLSTM (units=2)"]
-    with pytest.raises(ConfigError, match="1 runs of `test`, which do not know the seed"):
+    with pytest.raises(ConfigError, match="1 runs of `test`, which do not have the seed"):
         table(FakeRun(tags={"verb": "test"}), pick="spread")

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lightning_pose.reports.published_rows import FRAMES, SCENES, add_published, published_systems
+from lightning_pose.reports.published_rows import FRAMES, SCENES, add_published, read_published
 from lightning_pose.reports.table import Report
 from lightning_pose.scenes.combine import join_scenes
 from lightning_pose.scenes.scene import Frame, Scene
@@ -44,19 +44,19 @@ def clips_on(train: Sequence[Scene], test: Sequence[Scene]) -> Report:
 
 
 def cell(system: str, table: str, scene: str) -> tuple[float, float | None]:
-    (row,) = [row for row in published_systems() if (row.system, row.table) == (system, table)]
-    return row.cells[scene].position_m, row.cells[scene].orientation_deg
+    (cells,) = [cells for key, cells in read_published().items() if key[:2] == (table, system)]
+    return cells[scene].errors
 
 
 def test_every_table_is_whole() -> None:
-    rows = published_systems()
-    counts = {table: sum(row.table == table for row in rows) for table in ("2.3", "3.2", "4.1", "5.2", "6.1")}
+    rows = read_published()
+    counts = {table: sum(key[0] == table for key in rows) for table in ("2.3", "3.2", "4.1", "5.2", "6.1")}
     assert counts == {"2.3": 14, "3.2": 14, "4.1": 14, "5.2": 15, "6.1": 7}
-    for row in rows:
-        outdoors = row.table in ("4.1", "5.2") and len(row.cells) > 7
-        assert set(row.cells) == (set(FRAMES) if outdoors else set(list(FRAMES)[:7])), row.system
-        assert all(0.1 <= c.position_m <= 8 for c in row.cells.values())
-        assert all(c.orientation_deg is None or 1 <= c.orientation_deg <= 19 for c in row.cells.values())
+    for (table, system, _), cells in rows.items():
+        outdoors = table in ("4.1", "5.2") and len(cells) > 7
+        assert set(cells) == (set(FRAMES) if outdoors else set(list(FRAMES)[:7])), system
+        assert all(0.1 <= c.errors[0] <= 8 for c in cells.values())
+        assert all(c.errors[1] is None or 1 <= c.errors[1] <= 19 for c in cells.values())
 
 
 @pytest.mark.parametrize(
@@ -109,7 +109,7 @@ def test_rows_of_the_scenes_on_show() -> None:
     assert list(rows["SurfCNN 300"].cells) == ["redkitchen"]
     assert rows["SurfCNN 300"].cells["redkitchen"].text == ("0.37", "10.25")
     mean = rows["VidLoc"].means["mean"]
-    assert (mean.position_m, mean.orientation_deg, mean.scenes) == (0.31, None, 1)
+    assert (*mean.errors, mean.scenes) == (0.31, None, 1)
     assert any("table 2.3" in note and "recomputed" in note for note in report.footnotes)
     assert any("structure-based" in note for note in report.footnotes)
 
@@ -129,7 +129,7 @@ def test_cambridge_has_its_scenes() -> None:
     report = report_on("KingsCollege", "ShopFacade", dataset="cambridge", ground_truth="sfm", test_frames="343")
     add_published(report, [5])
     dense = next(row for row in report.rows if row.system == "Dense-PoseNet (Places)")
-    assert [(c.position_m, c.orientation_deg) for c in dense.cells.values()] == [(1.5, 2.9), (0.75, 3.5)]
+    assert [(c.errors[0], c.errors[1]) for c in dense.cells.values()] == [(1.5, 2.9), (0.75, 3.5)]
     assert any("0.8/47" in note for note in report.footnotes)
     assert not any("St Mary's" in note for note in report.footnotes)
     assert any("ShopFacade is a cut, 343 test frames of 103" in note for note in report.notes)
@@ -163,7 +163,7 @@ def test_means_stand_beside_the_seven_scenes(report: Report, column: str) -> Non
     assert len(means) == 8
     assert list(means["AtLoc"]) == [column]
     atloc = means["AtLoc"][column]
-    assert (atloc.position_m, atloc.orientation_deg, atloc.scenes) == (0.20, 7.56, 7)
+    assert (atloc.errors[0], atloc.errors[1], atloc.scenes) == (0.20, 7.56, 7)
 
 
 def test_means_over_seven_scenes_do_not_stand_beside_fewer() -> None:
@@ -178,8 +178,8 @@ def test_published_rows_have_a_mean_for_each_dataset() -> None:
     add_published(report, [5])
     (dense,) = [row for row in report.rows if row.system == "Dense-PoseNet (ImageNet)"]
     inside, outside = dense.means["mean 7scenes"], dense.means["mean cambridge"]
-    assert (inside.position_m, inside.scenes) == (pytest.approx(1.38 / 7), 7)
-    assert (outside.position_m, outside.orientation_deg) == (pytest.approx(4.6 / 3), pytest.approx(14 / 3))
+    assert (inside.errors[0], inside.scenes) == (pytest.approx(1.38 / 7), 7)
+    assert (outside.errors[0], outside.errors[1]) == (pytest.approx(4.6 / 3), pytest.approx(14 / 3))
 
 
 @pytest.mark.parametrize(("task", "systems"), [("relative", 2), ("absolute", 5)])
@@ -202,7 +202,7 @@ def test_a_model_trained_elsewhere_stands_beside_the_scene_it_was_tested_on(trai
     (scene,) = report.scenes
     assert scene.endswith(" to chess")
     add_published(report, [6])
-    assert [row.cells[scene].position_m for row in report.rows] == [0.22, 0.16]
+    assert [row.cells[scene].errors[0] for row in report.rows] == [0.22, 0.16]
     assert any(note.startswith("published rows are of the same official test frames") for note in report.notes)
 
 
@@ -233,7 +233,7 @@ def test_published_clips_are_of_scenes_that_were_not_seen() -> None:
     [
         ({"test_frames": "150"}, "do not compare: redkitchen is a cut, 150 test frames of 5000"),
         ({"split": "blocks"}, "do not compare: redkitchen has its own split (blocks)"),
-        ({}, "do not compare: redkitchen may be a cut, no run tells how many of the 5000 test frames it has"),
+        ({}, "do not compare: redkitchen may be a cut, no run records how many of the 5000 test frames it has"),
         ({"test_frames": "5000"}, "published rows are of the same official test frames"),
     ],
 )

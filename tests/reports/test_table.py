@@ -20,8 +20,8 @@ def test_rows_are_systems_and_columns_scenes(table) -> None:
     assert report.scenes == ["chess", "stairs", "office_b"]
     assert shown(report) == {"NodePose": {"chess": 0.2}, "SurfLSTM": {"chess": 0.1, "stairs": 0.3, "office_b": 0.5}}
     node, lstm = (row.means["mean"] for row in report.rows)
-    assert (lstm.position_m, lstm.orientation_deg, lstm.scenes) == (pytest.approx(0.3), pytest.approx(8.0), 3)
-    assert (node.position_m, node.orientation_deg, node.scenes) == (0.2, 7.0, 1)
+    assert (*lstm.errors, lstm.scenes) == (pytest.approx(0.3), pytest.approx(8.0), 3)
+    assert (*node.errors, node.scenes) == (0.2, 7.0, 1)
     assert any(note.startswith("a mean marked [k of n]") for note in report.notes)
 
 
@@ -35,7 +35,7 @@ def test_rows_by_settings_in_the_order_of_numbers(table) -> None:
         "SurfLSTM (features=surf)",
     ]
     assert report.rows[1].settings == {"model.neighbours": "20", "features": "surf"}
-    with pytest.raises(ConfigError, match=r"no run tells 'neighbors', .* did you mean model.neighbours\?"):
+    with pytest.raises(ConfigError, match=r"no run has 'neighbors', .* did you mean model.neighbours\?"):
         table(*runs, by=("neighbors",))
 
 
@@ -78,8 +78,8 @@ def test_clips_of_another_length_do_not_mix(table) -> None:
 def test_what_old_runs_do_not_tell_is_told(table) -> None:
     old = FakeRun("SurfLSTM", tags={"image_size": None, "split": None})
     report = table(old, FakeRun("NodePose", tags={"test_frames": "150"}))
-    (note,) = [note for note in report.notes if "do not tell" in note]
-    assert note == "1 of 2 runs do not tell split, image size, test frames: taken to match the others, not checked"
+    (note,) = [note for note in report.notes if "do not record" in note]
+    assert note == "1 of 2 runs do not record split, image size, test frames: taken to match the others, not checked"
     assert report.captions == ["chess: absolute poses, official split, original ground truth, images 640x480, "
                                "150 test frames"]  # fmt: skip
 
@@ -137,7 +137,7 @@ def test_a_mean_for_each_dataset(table) -> None:
     assert report.means == {"mean 7scenes": ["chess", "fire"], "mean cambridge": outside}
     node, lstm = report.rows
     assert {column: mean.scenes for column, mean in node.means.items()} == {"mean cambridge": 1}
-    errors = {column: (mean.position_m, mean.orientation_deg) for column, mean in lstm.means.items()}
+    errors = {column: mean.errors for column, mean in lstm.means.items()}
     assert errors == {"mean 7scenes": (pytest.approx(0.2), 7.0), "mean cambridge": (3.0, 4.0)}
     assert not any("scenes differ" in note for note in report.notes), "each mean is of scenes measured alike"
 
@@ -171,8 +171,7 @@ def test_costs_and_skill_are_means_over_scenes(table) -> None:
         FakeRun(metrics={"cost/train_seconds": 2.0, "test/skill_position": 0.5}),
         FakeRun(scene="fire", metrics={"cost/train_seconds": 4.0}),
     )
-    assert report.rows[0].costs == {"train_seconds": 3.0}
-    assert report.rows[0].skill == {}, "one scene has none"
+    assert report.rows[0].average_costs() == {"train_seconds": 3.0}, "one scene has no skill"
 
 
 def baseline(name: str, value: float) -> dict[str, float]:
@@ -194,8 +193,8 @@ def test_baselines_by_their_features(table) -> None:
         ("retrieval_top1", "surf"),
         ("oracle", ""),
     ]
-    assert rows[0].cells["fire"].orientation_deg == 5.0
-    assert rows[0].means["mean"].position_m == pytest.approx(0.35)
+    assert rows[0].cells["fire"].errors[1] == 5.0
+    assert rows[0].means["mean"].errors[0] == pytest.approx(0.35)
 
 
 def test_baselines_that_differ_say_whose_they_are(table) -> None:

@@ -15,7 +15,7 @@ import pytest
 
 from lightning_pose.errors import CheckpointError
 from lightning_pose.paths import default_tracking_uri
-from lightning_pose.runs.logger import REQUIREMENTS, MLflowLogger, flatten, last_run
+from lightning_pose.runs.logger import REQUIREMENTS, MLflowLogger, find_last_run, flatten_settings
 from lightning_pose.runs.process import has_died, identify_machine, process_name
 from tests.helpers import Trained, Workplace
 
@@ -59,7 +59,7 @@ def test_a_store_named_in_code_is_not_the_next_logger_s(tmp_path: Path, store: P
 
 def test_settings_by_dotted_name() -> None:
     spec = {"class_path": "a.Net", "init_args": {"units": 8, "loss": {"form": "joint"}}}
-    assert flatten({"model": spec, "seed": 0}) == {
+    assert flatten_settings({"model": spec, "seed": 0}) == {
         "model.class_path": "a.Net",
         "model.units": 8,
         "model.loss.form": "joint",
@@ -159,7 +159,7 @@ def test_parameters_of_a_run_that_goes_on_may_differ(logger: MLflowLogger) -> No
 def test_the_last_run_is_the_newest_of_that_architecture_and_scene(trained: Trained) -> None:
     def find(architecture: str, root: str) -> tuple[str, Path]:
         checkpoints = trained.workplace.folder / "mlruns" / "checkpoints"
-        return last_run(trained.workplace.uri, "lightning_pose", checkpoints, architecture, {"root": root})
+        return find_last_run(trained.workplace.uri, "lightning_pose", checkpoints, architecture, {"root": root})
 
     root = str(trained.workplace.scene)
     assert find("SurfLSTM", root) == (trained.run.info.run_id, trained.last)
@@ -171,7 +171,7 @@ def test_the_last_run_is_the_newest_of_that_architecture_and_scene(trained: Trai
 
 def test_no_experiment_has_no_last_run(workplace: Workplace) -> None:
     with pytest.raises(CheckpointError, match="no run of SurfLSTM"):
-        last_run(workplace.uri, "lightning_pose", workplace.folder, "SurfLSTM", {"root": None})
+        find_last_run(workplace.uri, "lightning_pose", workplace.folder, "SurfLSTM", {"root": None})
 
 
 def test_a_logged_model_names_all_that_it_imports() -> None:

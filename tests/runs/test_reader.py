@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from lightning_pose.errors import ConfigError
-from lightning_pose.runs.reader import Run, masked, read_runs, runs_of_client
+from lightning_pose.runs.reader import Run, mask_passwords, read_client_runs, read_runs
 from tests.stores import FakeRun, make_store
 
 
@@ -39,7 +39,7 @@ def test_tables_and_client_agree(tmp_path: Path, store: Path) -> None:
     assert [run.experiment for run in found] == ["another", "lightning_pose", "lightning_pose"]
     assert found[2].metrics == {**odd, **runs[0].all_metrics}
     assert "train/loss" not in found[1].metrics
-    client = runs_of_client(MlflowClient(uri), page=2)
+    client = read_client_runs(MlflowClient(uri), page=2)
     assert {run.run_id: plain(run) for run in client} == {run.run_id: plain(run) for run in found}
 
 
@@ -83,13 +83,13 @@ def test_no_address_of_a_store(uri: str) -> None:
 
 def test_a_database_of_something_else(tmp_path: Path) -> None:
     sqlite3.connect(tmp_path / "optuna.db").execute("CREATE TABLE trials (number INTEGER)").connection.close()
-    with pytest.raises(ConfigError, match=r"optuna.db is not an MLflow database: it has no table `experiments`"):
+    with pytest.raises(ConfigError, match=r"optuna.db cannot be read as .* .no such table: runs.; check --track"):
         read_runs(f"sqlite:///{tmp_path / 'optuna.db'}")
 
 
 def test_a_file_that_is_no_database(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("no database at all, but long enough to have a header" * 9)
-    with pytest.raises(ConfigError, match=r"notes.txt is not an MLflow database"):
+    with pytest.raises(ConfigError, match=r"notes.txt cannot be read as an MLflow database .file is not a database."):
         read_runs(f"sqlite:///{tmp_path / 'notes.txt'}")
 
 
@@ -107,7 +107,7 @@ def test_an_unreachable_database_keeps_its_password() -> None:
     ) as info:
         read_runs(uri)
     assert "secret" not in str(info.value)
-    assert masked("sqlite:///a.db") == "sqlite:///a.db"
+    assert mask_passwords("sqlite:///a.db") == "sqlite:///a.db"
 
 
 @pytest.mark.parametrize(
@@ -127,11 +127,11 @@ def test_no_message_has_a_password(uri: str, says: str, monkeypatch: pytest.Monk
 
 
 def test_an_empty_server_keeps_its_password(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("lightning_pose.runs.reader.runs_of_client", lambda client: [])
+    monkeypatch.setattr("lightning_pose.runs.reader.read_client_runs", lambda client: [])
     with pytest.raises(ConfigError, match=r"http://ada:\*\*\*@localhost:5000 has no finished run"):
         read_runs("http://ada:secret@localhost:5000")
 
 
 def test_passwords_are_masked_to_their_end() -> None:
-    assert masked("http://ada:s@cr/t@host:5000/x") == "http://ada:***@host:5000/x"
-    assert masked("see http://host:5000/a and mail@host") == "see http://host:5000/a and mail@host"
+    assert mask_passwords("http://ada:s@cr/t@host:5000/x") == "http://ada:***@host:5000/x"
+    assert mask_passwords("see http://host:5000/a and mail@host") == "see http://host:5000/a and mail@host"

@@ -14,14 +14,14 @@ from lightning_pose.data import ImageDataModule
 from lightning_pose.models import SurfLSTM
 from lightning_pose.runs.checkpoints import BestCheckpoint, LastCheckpoint, checkpoint_folder
 from lightning_pose.runs.logger import MLflowLogger
-from lightning_pose.runs.recorder import RunRecorder, train_seconds
+from lightning_pose.runs.recorder import RunRecorder, read_train_seconds
 from tests.helpers import REPOSITORY, Thumbnails, Trained, Workplace
 
 
 def test_checkpoints_of_no_run_are_local(tmp_path: Path) -> None:
     trainer = Trainer(default_root_dir=tmp_path, logger=False, accelerator="cpu", enable_progress_bar=False)
     assert checkpoint_folder(trainer) == tmp_path / "checkpoints" / "local"
-    assert train_seconds(trainer) is None
+    assert read_train_seconds(trainer) is None
 
 
 def test_tags_and_parameters(trained: Trained) -> None:

@@ -1,4 +1,4 @@
-"""Several scenes as one: who gives frames to which split."""
+"""Several scenes as one: which frames go into which split."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_what_is_trained_on_is_never_tested_on() -> None:
 
 
 def test_what_is_tested_is_named_last() -> None:
-    """So that a reader of the run knows which format and ground truth its errors are of."""
+    """The format and ground truth that errors are measured by come last."""
     room, chess = (
         replace(scene("room"), ground_truth="synthetic"),
         replace(scene("chess"), format="7scenes", ground_truth="original"),

@@ -92,7 +92,7 @@ def test_exif_orientation_is_ignored(orientation: int, tmp_path: Path) -> None:
     exif = b"\xff\xe1" + struct.pack(">H", len(tiff) + 8) + b"Exif\0\0" + tiff
     turned = tmp_path / "turned.jpg"
     turned.write_bytes(data[:2] + exif + data[2:])
-    if orientation != 3:  # OpenCV understands the tag; it is we who do not want it
+    if orientation != 3:  # OpenCV would apply the tag; `decode_image` asks it not to
         honoured = cv2.imread(str(turned))
         assert honoured is not None
         assert honoured.shape == (64, 48, 3)

@@ -96,7 +96,7 @@ def test_no_frames() -> None:
 
 @pytest.mark.parametrize(("block", "runs"), [(1, 4), (25, 4), (26, 2), (50, 2)])
 def test_validation_comes_in_runs_of_a_block(block: int, runs: int) -> None:
-    """13 sequences of 50 frames: halves serve as long as a block fits one, then whole sequences."""
+    """13 sequences of 50 frames: halves if a block fits into one, else whole sequences."""
     sequences = np.repeat([f"seq-{i:02d}" for i in range(13)], 50)
     kept, held = hold_out(np.arange(650), sequences, 0.1, "val_fraction", block)
     assert sorted([*kept, *held]) == list(range(650))

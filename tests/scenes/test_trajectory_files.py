@@ -1,4 +1,4 @@
-"""TUM files: column order, scalar last, one file a sequence."""
+"""TUM files: column order, scalar last, one file per sequence."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_columns(tmp_path: Path) -> None:
     np.testing.assert_allclose(rows[:, 7], QUATS_WXYZ[:, 0])
 
 
-def test_one_file_a_sequence_with_time_or_number(tmp_path: Path) -> None:
+def test_one_file_per_sequence_with_time_or_number(tmp_path: Path) -> None:
     frames = [frame("walk/a", 7), frame("b", 3, timestamp=0.25), frame("walk/a", 9)]
     files = write_sequences(tmp_path, frames, POSITIONS, QUATS_WXYZ)
     assert [file.name for file in files] == ["walk_a.tum", "b.tum"]

@@ -1,1 +1,1 @@
-"""What every model is measured against: of single images, of clips, and classical visual odometry."""
+"""Baselines: of single images, of clips, and classical visual odometry."""

@@ -1,4 +1,4 @@
-"""What a model of clips must beat without looking: no motion, and constant velocity."""
+"""Baselines for models of clips that use no images: no motion, and constant velocity."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from lightning_pose.errors import ConfigError
 from lightning_pose.geometry.quaternions import mean_quat, relative_pose
 from lightning_pose.geometry.relative import RelativeFrame, chain_steps, check_relative_frame
 
-__all__ = ["constant_velocity", "no_motion"]
+__all__ = ["predict_constant_velocity", "predict_no_motion"]
 
 
-def no_motion(clips: int, length: int) -> tuple[Tensor, Tensor]:
+def predict_no_motion(clips: int, length: int) -> tuple[Tensor, Tensor]:
     """Zeros (clips, length, 3) and identities (clips, length, 4), float64."""
     identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
     return torch.zeros(clips, length, 3, dtype=torch.float64), identity.repeat(clips, length, 1)
 
 
-def constant_velocity(
+def predict_constant_velocity(
     position_m: Tensor | np.ndarray,
     quat_wxyz: Tensor | np.ndarray,
     length: int,

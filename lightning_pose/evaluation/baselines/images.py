@@ -1,4 +1,4 @@
-"""What every model must beat: the mean pose, image retrieval in the same features, and its oracle."""
+"""Baselines for models of single images: the mean pose, image retrieval in the same features, and its oracle."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from lightning_pose.errors import ConfigError
-from lightning_pose.features.retrieval import global_vectors, nearest
+from lightning_pose.features.retrieval import compute_global_vectors, find_nearest
 from lightning_pose.geometry.quaternions import mean_quat, orientation_error_deg, position_error_m
 from lightning_pose.metrics.summary import summarize_errors
 
@@ -43,14 +43,14 @@ def evaluate_baselines(
     """Predict the test frames' poses without learning (Sattler et al., CVPR 2019).
 
     - `train_mean`: the mean of all training poses;
-    - `retrieval_top1`: the pose of the training frame nearest in `global_vectors`;
+    - `retrieval_top1`: the pose of the training frame nearest in `compute_global_vectors`;
     - `retrieval_top5`: the mean pose of the five nearest (of all, where there are fewer);
-    - `oracle`: the training pose nearest in position, which no retrieval can beat in that.
+    - `oracle`: the training pose nearest in position, a lower bound for the position errors of retrieval.
 
     Ties go to the earlier training frame, so a blank image, as far from all, gets the first.
 
     Args:
-        train_features: (N_train, ...) in a layout of `global_vectors`.
+        train_features: (N_train, ...) in a layout of `compute_global_vectors`.
         train_position_m: (N_train, 3).
         train_quat_wxyz: (N_train, 4).
         test_features: (N_test, ...), the same layout.
@@ -59,19 +59,19 @@ def evaluate_baselines(
         seed: of the k-means that local descriptors need.
 
     Raises:
-        ConfigError: no training or no test frames, or features that `global_vectors` refuses.
+        ConfigError: no training or no test frames, or features that `compute_global_vectors` refuses.
     """
     if not len(train_features) or not len(test_features):
         raise ConfigError(
             f"baselines need frames, but train has {len(train_features)} and test {len(test_features)}; "
             "check the scene's splits"
         )
-    position, quat = _poses(train_position_m, train_quat_wxyz)
-    true_position, true_quat = _poses(test_position_m, test_quat_wxyz)
-    train_vectors, test_vectors = global_vectors(train_features, test_features, seed)
-    ranked = nearest(test_vectors, train_vectors, k=5)
+    position, quat = _convert_poses(train_position_m, train_quat_wxyz)
+    true_position, true_quat = _convert_poses(test_position_m, test_quat_wxyz)
+    train_vectors, test_vectors = compute_global_vectors(train_features, test_features, seed)
+    ranked = find_nearest(test_vectors, train_vectors, k=5)
     centre = position.mean(0)  # small numbers keep digits, where coordinates are geographic
-    closest = nearest(true_position - centre, position - centre, k=1)
+    closest = find_nearest(true_position - centre, position - centre, k=1)
     chosen = {
         "train_mean": torch.arange(len(position))[None],
         "retrieval_top1": ranked[:, :1],
@@ -89,6 +89,7 @@ def evaluate_baselines(
     return results
 
 
-def _poses(position_m: Tensor | np.ndarray, quat_wxyz: Tensor | np.ndarray) -> tuple[Tensor, Tensor]:
+def _convert_poses(position_m: Tensor | np.ndarray, quat_wxyz: Tensor | np.ndarray) -> tuple[Tensor, Tensor]:
+    """The same poses as float64 tensors on the CPU."""
     position, quat = torch.as_tensor(position_m), torch.as_tensor(quat_wxyz)
     return position.detach().cpu().double(), quat.detach().cpu().double()

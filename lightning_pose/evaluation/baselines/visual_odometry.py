@@ -23,19 +23,27 @@ from lightning_pose.geometry.relative import RelativeFrame, chain_steps, check_r
 from lightning_pose.geometry.two_view import MIN_INLIERS, two_view_motion
 from lightning_pose.scenes.scene import Frame, Intrinsics
 
-__all__ = ["Motion", "View", "clip_poses", "match_motion", "visual_odometry"]
+__all__ = [
+    "Motion",
+    "View",
+    "assume_intrinsics",
+    "describe_frame",
+    "match_motion",
+    "read_clip_poses",
+    "run_visual_odometry",
+]
 
 N_FEATURES = 1000
 
 FOCAL_PER_SIDE = 525 / 640
-"""Focal length by the image's longer side, where a dataset does not tell the camera: that of 7-Scenes' Kinect."""
+"""Focal length by the image's longer side, where a dataset does not give the camera: that of 7-Scenes' Kinect."""
 
-CHUNK = 8  # steps a worker gets at a time: it bounds how many images' features are held
+CHUNK = 8  # steps that a worker gets at a time, which bounds how many images' features are held
 
 
 @dataclass(frozen=True)
 class View:
-    """What of an image takes part in odometry.
+    """The features of an image that odometry matches.
 
     Attributes:
         points: (N, 2) float64 in normalised image coordinates, (pixel - centre) / focal length.
@@ -50,12 +58,12 @@ class View:
 
 @dataclass(frozen=True)
 class Motion:
-    """Poses relative to the first frame of each clip, and how they came about.
+    """Poses relative to the first frame of each clip, and how many steps they are made of.
 
     Attributes:
         position_m: (B, T, 3) float64.
         quat_wxyz: (B, T, 4) float64, unit, w >= 0.
-        failed_steps: how many of the steps stand still because `two_view_motion` found none.
+        failed_steps: steps without motion because `two_view_motion` found none.
         steps: distinct steps, however many clips share them.
     """
 
@@ -65,22 +73,21 @@ class Motion:
     steps: int
 
 
-def visual_odometry(
+def run_visual_odometry(
     frames: Sequence[Frame],
     clips: np.ndarray | Tensor,
     relative_frame: RelativeFrame = "camera",
     progress: bool = True,
     workers: int | None = None,
 ) -> Motion:
-    """What a model of clips must beat: two-frame odometry from images alone, without learning or a map.
+    """A baseline for models of clips: two-frame odometry from images alone, without learning or a map.
 
-    One camera cannot know its scale, so **each step's length is taken from the truth**; only its direction and
-    rotation are estimated. A step that fails (`two_view_motion`) stands still. In `world` axes, the positions are
+    Images of one camera do not determine scale, so **each step's length is taken from the truth**; only its direction
+    and rotation are estimated. A step that fails (`two_view_motion`) has no motion. In `world` axes, the positions are
     turned by the clip's **true first orientation**, which images do not give either.
 
-    Each image is described once, and each pair of frames that some clip has as neighbours is matched once. A camera
-    that the dataset does not give has `FOCAL_PER_SIDE` of the longer side as its focal length and its centre in the
-    middle.
+    Each image is described once, and each pair of frames that are neighbours in some clip is matched once. Where the
+    dataset does not give the camera, `assume_intrinsics` does.
 
     Args:
         frames: with their true poses.
@@ -94,11 +101,11 @@ def visual_odometry(
         ImageError: an image cannot be read.
     """
     check_relative_frame(relative_frame)
-    rows = _checked(clips, len(frames))
+    rows = _check_clips(clips, len(frames))
     neighbours = np.stack([rows[:, :-1], rows[:, 1:]], axis=-1)
     unique, which = np.unique(neighbours.reshape(-1, 2), axis=0, return_inverse=True)
     pairs: list[tuple[int, int]] = [(int(a), int(b)) for a, b in unique]
-    found = _estimate(frames, pairs, workers or _cores(), progress)
+    found = _estimate_steps(frames, pairs, workers or _count_cores(), progress)
     step_position, step_quat = torch.zeros(len(pairs), 3).double(), torch.eye(4)[:1].double().repeat(len(pairs), 1)
     for number, ((a, b), motion) in enumerate(zip(pairs, found, strict=True)):
         if motion is not None:
@@ -107,44 +114,49 @@ def visual_odometry(
     which = torch.from_numpy(which.reshape(neighbours.shape[:2]))
     position_m, quat_wxyz = chain_steps(step_position[which], step_quat[which])
     if relative_frame == "world":
-        position_m = quat_rotate(clip_poses(frames, rows[:, :1])[1], position_m)
+        position_m = quat_rotate(read_clip_poses(frames, rows[:, :1])[1], position_m)
     failed = sum(motion is None for motion in found)
     return Motion(position_m, quat_wxyz, failed, len(pairs))
 
 
-def clip_poses(frames: Sequence[Frame], clips: np.ndarray | Tensor) -> tuple[Tensor, Tensor]:
+def read_clip_poses(frames: Sequence[Frame], clips: np.ndarray | Tensor) -> tuple[Tensor, Tensor]:
     """True position_m (B, T, 3) and quat_wxyz (B, T, 4) in the world, float64, of (B, T) indices into frames.
 
     Raises:
-        ConfigError: as `visual_odometry`.
+        ConfigError: as `run_visual_odometry`.
     """
-    rows = torch.from_numpy(_checked(clips, len(frames)))
+    rows = torch.from_numpy(_check_clips(clips, len(frames)))
     position_m = torch.from_numpy(np.array([frame.position_m for frame in frames], np.float64))
     quat_wxyz = torch.from_numpy(np.array([frame.quat_wxyz for frame in frames], np.float64))
     return position_m.view(-1, 3)[rows], quat_wxyz.view(-1, 4)[rows]
 
 
-def _estimate(
+def _estimate_steps(
     frames: Sequence[Frame], pairs: list[tuple[int, int]], workers: int, progress: bool
 ) -> list[tuple[Tensor, Tensor] | None]:
-    """`match_motion` of each pair, in order; the features of an image live from its first pair to its last."""
+    """`match_motion` of each pair, in order; an image's features are kept from its first pair to its last."""
     last_use = {image: number for number, pair in enumerate(pairs) for image in pair}
     views: dict[int, View] = {}
     size, found = CHUNK * workers, []
-    with _bar(progress and len(pairs) > 0) as bar, _one_thread_inside(), ThreadPoolExecutor(workers) as pool:
+    with (
+        _open_progress(progress and len(pairs) > 0) as bar,
+        _limit_opencv_threads(),
+        ThreadPoolExecutor(workers) as pool,
+    ):
         task = bar.add_task("visual odometry", total=len(pairs))
         for start in range(0, len(pairs), size):
             chunk = pairs[start : start + size]
             new = sorted({image for pair in chunk for image in pair} - views.keys())
-            views.update(zip(new, pool.map(_view, [frames[image] for image in new]), strict=True))
-            for motion in pool.map(_step, [(views[a], views[b]) for a, b in chunk]):
+            views.update(zip(new, pool.map(describe_frame, [frames[image] for image in new]), strict=True))
+            for motion in pool.map(_estimate_step, [(views[a], views[b]) for a, b in chunk]):
                 found.append(motion)
                 bar.advance(task)
             views = {image: view for image, view in views.items() if last_use[image] >= start + size}
     return found
 
 
-def _step(views: tuple[View, View]) -> tuple[Tensor, Tensor] | None:
+def _estimate_step(views: tuple[View, View]) -> tuple[Tensor, Tensor] | None:
+    """`match_motion` of two views; no motion between a view and itself."""
     if views[0] is views[1]:  # a frame repeated has not moved, which is no failure
         return torch.zeros(3).double(), torch.eye(4)[0].double()
     return match_motion(*views)
@@ -158,22 +170,28 @@ def match_motion(a: View, b: View) -> tuple[Tensor, Tensor] | None:
     return two_view_motion(a.points[rows_a], b.points[rows_b], 0.5 * (a.focal_px + b.focal_px))
 
 
-def _view(frame: Frame) -> View:
+def describe_frame(frame: Frame) -> View:
+    """Extract an image's SIFT features, in normalised coordinates.
+
+    Raises:
+        ImageError: the image cannot be read.
+    """
     sift = SIFT(N_FEATURES)
     record = sift.extract([sift.read(frame.image)])[0]
     count = int(record["count"])
-    camera = frame.intrinsics or _assumed(*record["image_size"].tolist())
+    camera = frame.intrinsics or assume_intrinsics(*record["image_size"].tolist())
     pixels = record["keypoints"][:count, :2].astype(np.float64)
     points = (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
     return View(points, record["descriptors"][:count], 0.5 * (camera.fx + camera.fy))
 
 
-def _assumed(width: int, height: int) -> Intrinsics:
+def assume_intrinsics(width: int, height: int) -> Intrinsics:
+    """The camera of an image of unknown origin: `FOCAL_PER_SIDE` of the longer side, and the centre in the middle."""
     focal = FOCAL_PER_SIDE * max(width, height)
     return Intrinsics(focal, focal, width / 2, height / 2)
 
 
-def _checked(clips: np.ndarray | Tensor, total: int) -> np.ndarray:
+def _check_clips(clips: np.ndarray | Tensor, total: int) -> np.ndarray:
     """(B, T) int64, T >= 1, all within 0..total-1."""
     rows = np.asarray(clips)
     if rows.ndim != 2 or rows.shape[1] < 1 or not np.issubdtype(rows.dtype, np.integer):
@@ -183,14 +201,14 @@ def _checked(clips: np.ndarray | Tensor, total: int) -> np.ndarray:
     return rows.astype(np.int64)
 
 
-def _cores() -> int:
+def _count_cores() -> int:
     """Cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @contextmanager
-def _one_thread_inside() -> Iterator[None]:
-    """Keep OpenCV from starting threads in each of ours."""
+def _limit_opencv_threads() -> Iterator[None]:
+    """Keep OpenCV from starting further threads in each worker thread."""
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
@@ -199,6 +217,7 @@ def _one_thread_inside() -> Iterator[None]:
         cv2.setNumThreads(before)
 
 
-def _bar(shown: bool) -> Progress:
+def _open_progress(shown: bool) -> Progress:
+    """A progress bar on stderr; disabled where it is not to be shown."""
     columns = "{task.description}", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     return Progress(*columns, console=Console(stderr=True), disable=not shown)

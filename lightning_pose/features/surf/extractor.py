@@ -1,4 +1,4 @@
-"""SURF, upright or oriented: the keypoints and 64 numbers each that the thesis's networks read.
+"""SURF, upright or oriented: keypoints with descriptors of 64 numbers, which the thesis's networks read.
 
 Bay, Tuytelaars, Van Gool: "SURF: Speeded Up Robust Features", ECCV 2006, and the extended version of 2008,
 with OpenCV's conventions (window placement, angles, the order of the numbers), as batched tensor
@@ -17,14 +17,14 @@ from torch import Tensor
 
 from lightning_pose.errors import ConfigError, ImageError
 from lightning_pose.features.base import LocalExtractor, Record
-from lightning_pose.features.surf.descriptor import UPRIGHT_ANGLE, describe, orientations
-from lightning_pose.features.surf.detector import detect
-from lightning_pose.features.surf.hessian import integral_image
+from lightning_pose.features.surf.descriptor import UPRIGHT_ANGLE, compute_descriptors, compute_orientations
+from lightning_pose.features.surf.detector import detect_keypoints
+from lightning_pose.features.surf.hessian import compute_integral_image
 
 __all__ = ["SURF", "SurfFeatures"]
 
 BATCH = 16
-"""Images worked on at once on a GPU. A CPU takes them one by one, because one image fills its cache."""
+"""Images in a batch on a GPU. On a CPU a batch is one image, because one image fills the CPU's cache."""
 
 
 class SurfFeatures(NamedTuple):
@@ -46,9 +46,9 @@ class SURF(LocalExtractor):
 
     Args:
         n_features: N, how many of the strongest features to return.
-        upright: do not look for each keypoint's orientation (U-SURF): faster, and what the thesis uses.
-        threshold: what a keypoint's determinant of the Hessian must exceed, on the scale of OpenCV's
-            hessianThreshold; 0 keeps every keypoint.
+        upright: do not compute each keypoint's orientation (U-SURF): this is faster, and the thesis does the same.
+        threshold: the determinant of the Hessian of a keypoint must exceed it; the scale is that of OpenCV's
+            hessianThreshold, and 0 keeps every keypoint.
         with_geometry: as for `LocalExtractor`.
 
     Raises:
@@ -72,14 +72,14 @@ class SURF(LocalExtractor):
 
     @torch.no_grad()
     def __call__(self, images: Tensor) -> SurfFeatures:
-        """Features of (B, H, W) grayscale images, uint8 or float in 0..1, on the images' device.
+        """Compute features of (B, H, W) grayscale images, uint8 or float in 0..1, on the images' device.
 
         Float images are rounded to 8 bits first. Images smaller than the filters have no features.
 
         Raises:
             ImageError: another number of axes, no pixels, another type, or floats outside 0..1.
         """
-        return self._run(_as_uint8(images), self.n_features)
+        return self._compute_features(_convert_to_uint8(images), self.n_features)
 
     @torch.no_grad()
     def extract(self, images: Sequence[np.ndarray]) -> list[Record]:
@@ -98,7 +98,7 @@ class SURF(LocalExtractor):
         records: list[Record] = [{}] * len(images)
         for (height, width), members in alike.items():
             batch = torch.from_numpy(np.stack([images[i] for i in members]))
-            found = self._run(batch, self.n_stored)
+            found = self._compute_features(batch, self.n_stored)
             for i, keypoints, descriptors, count in zip(members, *(f.numpy() for f in found), strict=True):
                 records[i] = {
                     "descriptors": descriptors,
@@ -109,38 +109,42 @@ class SURF(LocalExtractor):
         return records
 
     def check_mirror(self) -> None:
-        """Refuse oriented descriptors: they are mirrored around an axis that only the image knows."""
+        """Raise a ConfigError for oriented descriptors: the mirrored ones cannot be computed without the image."""
         if not self.upright:
             raise ConfigError("data.mirror is on, but SURF descriptors are oriented; set upright: true, or turn it off")
 
     def mirror(self, features: Tensor) -> Tensor:
-        """(..., N, D): a descriptor's 4 x 4 cells change sides, its sums across the image their sign, and so does x.
+        """Mirror features (..., N, D): reverse the columns of 4 x 4 cells, and the signs of the sums across and of x.
 
-        In OpenCV's order cells go to the right first, and a cell's sums are upwards, across, and of both sizes.
+        In OpenCV's order the cells of a descriptor go to the right first, and a cell has four sums: upwards, across,
+        and the absolute values of both.
         """
         cells = features[..., :64].unflatten(-1, (4, 4, 4)).flip(-3) * features.new_tensor([1.0, -1, 1, 1])
         rest = features[..., 64:].clone()
         rest[..., :1] = -rest[..., :1]
         return torch.cat([cells.flatten(-3), rest], dim=-1)
 
-    def _run(self, gray: Tensor, n: int) -> SurfFeatures:
-        chunks = [self._chunk(chunk, n) for chunk in gray.split(1 if gray.device.type == "cpu" else BATCH)]
-        return SurfFeatures(*(torch.cat(column) for column in zip(*chunks, strict=True)))
+    def _compute_features(self, gray: Tensor, n: int) -> SurfFeatures:
+        """Compute the n strongest features of images (B, H, W) uint8, batch by batch."""
+        batches = [self._compute_batch(batch, n) for batch in gray.split(1 if gray.device.type == "cpu" else BATCH)]
+        return SurfFeatures(*(torch.cat(column) for column in zip(*batches, strict=True)))
 
-    def _chunk(self, gray: Tensor, n: int) -> SurfFeatures:
-        integral = integral_image(gray)
-        found = detect(integral, n, self.threshold)
+    def _compute_batch(self, gray: Tensor, n: int) -> SurfFeatures:
+        """Compute the n strongest features of the images of one batch."""
+        integral = compute_integral_image(gray)
+        found = detect_keypoints(integral, n, self.threshold)
         image = torch.arange(len(gray), device=gray.device).repeat_interleave(n)
         xy, size = found.xy.flatten(0, 1), found.size.flatten()
-        angle = None if self.upright else orientations(integral, image, xy, size)
-        descriptors = describe(integral, image, xy, size, angle).unflatten(0, (len(gray), n))
+        angle = None if self.upright else compute_orientations(integral, image, xy, size)
+        descriptors = compute_descriptors(integral, image, xy, size, angle).unflatten(0, (len(gray), n))
         degrees = torch.full_like(size, UPRIGHT_ANGLE) if angle is None else angle
         degrees = degrees.view_as(found.size) * (found.size > 0)
         columns = torch.stack([found.size, found.response, degrees], -1)
         return SurfFeatures(torch.cat([found.xy, columns], -1), descriptors, found.count)
 
 
-def _as_uint8(images: Tensor) -> Tensor:
+def _convert_to_uint8(images: Tensor) -> Tensor:
+    """Check images (B, H, W) and round floats in 0..1 to uint8; raise the errors of `SURF.__call__`."""
     if images.ndim != 3 or 0 in images.shape[1:]:
         raise ImageError(
             f"the images have shape {tuple(images.shape)}; give (B, H, W) grayscale (one image: image[None])"

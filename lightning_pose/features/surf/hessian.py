@@ -1,7 +1,7 @@
-"""SURF's filters: integral images, and the determinant of the Hessian from box sums, on grids and at points.
+"""SURF's filters: integral images, and the determinant of the Hessian from box sums, on grids and at single samples.
 
 Bay, Ess, Tuytelaars, Van Gool: "Speeded-Up Robust Features", 2008, section 3.2. Filter sizes and sampling
-are laid out as OpenCV does it: 4 octaves of 5 layers, octave o sampled every 2**o pixels. Sample (row,
+are those of OpenCV: 4 octaves of 5 layers, octave o sampled every 2**o pixels. Sample (row,
 column) of an octave is the centre of its filters, whatever their size.
 """
 
@@ -15,7 +15,16 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-__all__ = ["LAYERS", "OCTAVES", "carve", "determinants", "determinants_at", "filter_size", "integral_image", "margin"]
+__all__ = [
+    "LAYERS",
+    "OCTAVES",
+    "compute_determinants",
+    "compute_determinants_at",
+    "compute_filter_size",
+    "compute_integral_image",
+    "compute_margin",
+    "view_head",
+]
 
 OCTAVES = 4
 LAYERS = 5
@@ -23,10 +32,11 @@ LAYERS = 5
 Number = TypeVar("Number", int, Tensor)
 
 
-def integral_image(gray: Tensor) -> Tensor:
-    """(B, H, W) uint8 -> (B, H + 1, W + 1) int32: [:, y, x] is the sum over rows < y and columns < x.
+def compute_integral_image(gray: Tensor) -> Tensor:
+    """Compute integral images (B, H + 1, W + 1) int32 of images (B, H, W) uint8.
 
-    On huge images the sums wrap around, and every box sum below 2**31 is still exact.
+    Entry [:, y, x] is the sum over rows < y and columns < x. On very large images the sums overflow, but box sums below
+    2**31 are still exact.
     """
     rows = torch.cumsum(gray, 2, dtype=torch.int32)
     integral = gray.new_zeros((gray.shape[0], gray.shape[1] + 1, gray.shape[2] + 1), dtype=torch.int32)
@@ -34,49 +44,49 @@ def integral_image(gray: Tensor) -> Tensor:
     return integral
 
 
-def filter_size(octave: Number, layer: Number) -> Number:
-    """Side of a layer's filter, pixels."""
+def compute_filter_size(octave: Number, layer: Number) -> Number:
+    """Side of a layer's filter in pixels."""
     return (9 + 6 * layer) << octave
 
 
-def margin(layer: Number) -> Number:
-    """Samples of an octave before the first whose filter lies inside the image."""
+def compute_margin(layer: Number) -> Number:
+    """Number of samples of an octave before the first one whose filter lies inside the image."""
     return 4 + 3 * layer
 
 
-def carve(memory: Tensor, *shape: int) -> Tensor:
-    """The head of a flat tensor, in another shape."""
+def view_head(memory: Tensor, *shape: int) -> Tensor:
+    """View the first elements of a flat tensor in another shape."""
     return memory.narrow(0, 0, math.prod(shape)).view(shape)
 
 
-def determinants(integral: Tensor, octave: int, layer: int, first: int, scratch: Tensor, out: Tensor) -> None:
-    """Write a layer's determinants at the (n, m) samples from (first, first) on.
+def compute_determinants(integral: Tensor, octave: int, layer: int, first: int, scratch: Tensor, out: Tensor) -> None:
+    """Write a layer's determinants at the (n, m) samples from (first, first) on into `out`.
 
-    Every sum of boxes is built from shifted differences of whole planes, each shared by many boxes, in
-    memory that is used over and over: page faults would cost as much as the sums.
+    Box sums are differences of shifted planes, which many boxes share. They are computed in memory that is reused,
+    because page faults of new memory would take as long as the sums.
 
     Args:
         integral: (B, H + 1, W + 1) int32.
         scratch: (4, at least B * H * W) float32, overwritten.
         out: (B, n, m) float32.
     """
-    size, step, start = filter_size(octave, layer), 1 << octave, (first - margin(layer)) << octave
-    lobe, near, far, first_lobe, second_lobe = _edges(size)
+    size, step, start = compute_filter_size(octave, layer), 1 << octave, (first - compute_margin(layer)) << octave
+    lobe, near, far, first_lobe, second_lobe = _find_lobe_edges(size)
     (batch, n, m), t = out.shape, lobe // step
     whole = scratch.view(torch.int32)
-    dxx, dyy = carve(scratch[2], batch, n, m), carve(scratch[3], batch, n, m)
+    dxx, dyy = view_head(scratch[2], batch, n, m), view_head(scratch[3], batch, n, m)
     plane, line, _ = integral.stride()
     at = integral.storage_offset() + start * (line + 1)
 
     def change(y0: int, x0: int, y1: int, x1: int, rows: int, cols: int, step: int = step) -> Tensor:
         shape, stride = (batch, rows, cols), (plane, step * line, step)
         low, high = (integral.as_strided(shape, stride, at + y * line + x) for y, x in ((y0, x0), (y1, x1)))
-        return torch.sub(high, low, out=carve(whole[0], *shape))
+        return torch.sub(high, low, out=view_head(whole[0], *shape))
 
     band = change(near, 0, far, 0, n, m + 3 * t)
-    _lobes([band.narrow(2, k * t, m) for k in range(4)], whole[1], dxx)
+    _sum_lobes([band.narrow(2, k * t, m) for k in range(4)], whole[1], dxx)
     band = change(0, near, 0, far, n + 3 * t, m)
-    _lobes([band.narrow(1, k * t, n) for k in range(4)], whole[1], dyy)
+    _sum_lobes([band.narrow(1, k * t, n) for k in range(4)], whole[1], dyy)
     dxx.mul_(dyy)
 
     apart = second_lobe - first_lobe
@@ -85,9 +95,9 @@ def determinants(integral: Tensor, octave: int, layer: int, first: int, scratch:
     rows, cols = (n - 1) * u + 1, (m - 1) * u + 1
     wide = cols + c
     band = change(first_lobe, first_lobe, first_lobe + lobe, first_lobe, rows + c, wide + t, grid)
-    band = torch.sub(band[:, :rows:u], band[:, c::u], out=carve(whole[1], batch, n, wide + t))
-    band = torch.sub(band[..., t:], band[..., :-t], out=carve(whole[0], batch, n, wide))
-    band = torch.sub(band[..., :cols:u], band[..., c::u], out=carve(whole[1], batch, n, m))
+    band = torch.sub(band[:, :rows:u], band[:, c::u], out=view_head(whole[1], batch, n, wide + t))
+    band = torch.sub(band[..., t:], band[..., :-t], out=view_head(whole[0], batch, n, wide))
+    band = torch.sub(band[..., :cols:u], band[..., c::u], out=view_head(whole[1], batch, n, m))
     dxy = dyy.copy_(band)
 
     area = lobe * (far - near)
@@ -95,12 +105,19 @@ def determinants(integral: Tensor, octave: int, layer: int, first: int, scratch:
     torch.mul(dxx, area**-2, out=out)
 
 
-def determinants_at(integral: Tensor, octave: Tensor, layer: Tensor, image: Tensor, row: Tensor, col: Tensor) -> Tensor:
-    """(3, 3, K) determinants (row, column) at and around each of K samples; all arguments are (K,) int64."""
+def compute_determinants_at(
+    integral: Tensor, octave: Tensor, layer: Tensor, image: Tensor, row: Tensor, col: Tensor
+) -> Tensor:
+    """Compute determinants (3, 3, K), by row and column, at and around each of K samples.
+
+    Args:
+        integral: (B, H + 1, W + 1) int32.
+        octave: (K,) int64, as are the others: layer, image, and row and column in the octave's samples.
+    """
     plane, line, _ = integral.stride()
-    corners, areas = _boxes(integral.device)
+    corners, areas = _make_boxes(integral.device)
     layer_id = octave * LAYERS + layer
-    near = torch.arange(-1, 2, device=row.device)[:, None] - margin(layer)
+    near = torch.arange(-1, 2, device=row.device)[:, None] - compute_margin(layer)
     y, x = (row + near) << octave, (col + near) << octave
     base = ((y * line + image * plane)[:, None] + x).int()
     offset = (corners[0] * line + corners[1]).index_select(1, layer_id)
@@ -113,26 +130,26 @@ def determinants_at(integral: Tensor, octave: Tensor, layer: Tensor, image: Tens
     return dxx * dyy - dxy * dxy
 
 
-def _edges(size: int) -> tuple[int, int, int, int, int]:
-    """The paper's 9 x 9 filters, scaled.
+def _find_lobe_edges(size: int) -> tuple[int, int, int, int, int]:
+    """Positions of the lobes in a filter of this size, scaled from the paper's 9 x 9 filters.
 
     Returns:
-        width of a lobe; near and far edge of a lobe's long side; near edges of the diagonal lobes.
+        width of a lobe; first and last edge of a lobe's long side; first edges of the two diagonal lobes.
     """
     near, far, first, second = (round(size * ninths / 9) for ninths in (2, 7, 1, 5))
     return size // 3, near, far, first, second
 
 
-def _lobes(edges: list[Tensor], scratch: Tensor, out: Tensor) -> None:
-    """Write the sum over three adjoining lobes, weighted 1, -2, 1, from the integrals at their four edges."""
+def _sum_lobes(edges: list[Tensor], scratch: Tensor, out: Tensor) -> None:
+    """Write the sum over three adjoining lobes, with weights 1, -2, 1, from the integrals at their four edges."""
     a, b, c, d = edges
-    middle = torch.sub(c, b, out=carve(scratch, *out.shape))
+    middle = torch.sub(c, b, out=view_head(scratch, *out.shape))
     out.copy_(torch.add(d, middle, alpha=-3, out=middle).sub_(a))
 
 
 @lru_cache(maxsize=4)
-def _boxes(device: torch.device) -> tuple[Tensor, Tensor]:
-    """The filters of all layers (octave * LAYERS + layer) as eight boxes: two of dxx, two of dyy, four of dxy.
+def _make_boxes(device: torch.device) -> tuple[Tensor, Tensor]:
+    """The filters of all layers (octave * LAYERS + layer) as eight boxes each: two of dxx, two of dyy, four of dxy.
 
     Returns:
         (2, 32, 20) int32: y and x of the boxes' corners, corner by corner; (2, 20) float32: the areas that
@@ -140,8 +157,8 @@ def _boxes(device: torch.device) -> tuple[Tensor, Tensor]:
     """
     boxes, areas = [], []
     for octave, layer in product(range(OCTAVES), range(LAYERS)):
-        size = filter_size(octave, layer)
-        lobe, near, far, first, second = _edges(size)
+        size = compute_filter_size(octave, layer)
+        lobe, near, far, first, second = _find_lobe_edges(size)
         long, whole, middle = (near, far), (0, size), (lobe, 2 * lobe)
         diagonal = [(k, k + lobe) for k in (first, second)]
         spans = [(long, whole), (long, middle), (whole, long), (middle, long), *product(diagonal, diagonal)]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -24,8 +23,8 @@ class GraphConvolution(nn.Module):
             SAGEConv, GATConv, GATv2Conv or TransformerConv.
         in_width: columns of a node's state.
         out_width: columns of its new state.
-        aggr: how messages are brought together: `add`, `mean` or `max`; the convolution's own way if not given, which
-            for `gcn` is a mean.
+        aggr: how messages are joined: `add`, `mean` or `max`; the convolution's own way if not given, which for `gcn`
+            is a mean.
 
     Raises:
         ConfigError: there is no such convolution, or it cannot be built from two widths.
@@ -38,17 +37,17 @@ class GraphConvolution(nn.Module):
 
         name = _SHORT_NAMES.get(conv, conv)
         self.is_gcn = name == "GCNConv"
-        options: dict[str, Any] = {} if aggr is None else {"aggr": aggr}
+        options: dict[str, object] = {} if aggr is None else {"aggr": aggr}
         try:
             kind: type[nn.Module] = getattr(pyg, name)
-            # PyG would join a target to the source of the same number, which is another node: loops are ours.
+            # PyG would join a target to the source of the same number, which is another node: we add the loops.
             self.has_loops = "add_self_loops" in inspect.signature(kind).parameters
             if self.has_loops:
                 options["add_self_loops"] = False
             if self.is_gcn:
-                options["normalize"] = False  # it would need the degrees of sources, which nobody knows here
+                options["normalize"] = False  # it would need the degrees of sources, which are not known here
                 if aggr == "mean":
-                    del options["aggr"]  # its weights make the mean already, and a second one would leave little
+                    del options["aggr"]  # its weights make the mean already; a second division would shrink it
             self.layer = kind(in_width, out_width, **options)
             with torch.no_grad():
                 shape = self(torch.zeros(1, in_width), torch.zeros(2, in_width), torch.tensor([[0, 1], [0, 0]])).shape

@@ -1,4 +1,4 @@
-"""Graphs of nearest neighbours: the search, its edges, and the part of a graph that some nodes depend on.
+"""Graphs of nearest neighbours: the search, its edges, and the part of a graph that some nodes' states depend on.
 
 A graph is a table (N, K) of int64: row i holds the neighbours of node i, nearest first, and `ABSENT` in
 the places that stay empty.
@@ -9,10 +9,17 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-__all__ = ["ABSENT", "edge_index", "neighbourhood", "neighbours_within", "sample_neighbours", "search_neighbours"]
+__all__ = [
+    "ABSENT",
+    "find_neighbourhood",
+    "list_edges",
+    "sample_neighbours",
+    "search_neighbours",
+    "search_within_graph",
+]
 
 ABSENT = -1
-_CHUNK_ELEMENTS = 2**22  # of the distances in memory at a time: 16 MB
+CHUNK_ELEMENTS = 2**22  # 16 MB
 
 
 def search_neighbours(
@@ -22,8 +29,9 @@ def search_neighbours(
     query_frame: Tensor | None = None,
     reference_frame: Tensor | None = None,
     gap: int = 1,
+    chunk_elements: int = CHUNK_ELEMENTS,
 ) -> Tensor:
-    """The k nearest rows of `reference` by L2 for each row of `query`, searched in chunks of bounded memory.
+    """Find the k nearest rows of `reference` by L2 for each row of `query`, in chunks of bounded memory.
 
     Args:
         query: (Q, D).
@@ -32,13 +40,14 @@ def search_neighbours(
         query_frame: (Q,) places along the trajectory; where given, only reference rows at least `gap` away count.
         reference_frame: (N,) of the same trajectory; needed with `query_frame`.
         gap: 1 keeps a node from being its own neighbour.
+        chunk_elements: distances in memory at a time.
 
     Returns:
         (Q, k) table, nearest first.
     """
     table = torch.full((len(query), k), ABSENT, device=query.device)
     most = min(k, len(reference))
-    for rows in torch.arange(len(query), device=query.device).split(max(1, _CHUNK_ELEMENTS // max(1, len(reference)))):
+    for rows in torch.arange(len(query), device=query.device).split(max(1, chunk_elements // max(1, len(reference)))):
         distance = torch.cdist(query[rows], reference)
         if query_frame is not None and reference_frame is not None:
             near_in_time = (query_frame[rows, None] - reference_frame).abs() < gap
@@ -48,15 +57,15 @@ def search_neighbours(
     return table
 
 
-def neighbours_within(nodes: Tensor, k: int) -> Tensor:
-    """The k nearest other nodes of the same graph, for B graphs of M nodes at once.
+def search_within_graph(nodes: Tensor, k: int) -> Tensor:
+    """Find the k nearest other nodes of the same graph, for B graphs of M nodes at once.
 
     Args:
         nodes: (B, M, D).
         k: how many; all others where there are fewer.
 
     Returns:
-        (B * M, min(k, M - 1)) table of one graph, in which the B are apart.
+        (B * M, min(k, M - 1)) table of one graph, with no edges between the B graphs.
     """
     B, M, _ = nodes.shape
     distance = torch.cdist(nodes.detach(), nodes.detach())
@@ -66,20 +75,28 @@ def neighbours_within(nodes: Tensor, k: int) -> Tensor:
     return (nearest + first[:, None, None]).flatten(0, 1)
 
 
-def edge_index(table: Tensor) -> Tensor:
+def list_edges(table: Tensor) -> Tensor:
     """Edges (2, E) as PyG reads them: from each neighbour (first row) to its node (second row)."""
     node, place = (table != ABSENT).nonzero(as_tuple=True)
     return torch.stack([table[node, place], node])
 
 
 def sample_neighbours(table: Tensor, count: int) -> Tensor:
-    """(N, min(count, K)): neighbours of each node drawn without replacement (Hamilton et al., NeurIPS 2017)."""
+    """Draw up to `count` neighbours of each node without replacement (Hamilton et al., NeurIPS 2017).
+
+    Args:
+        table: (N, K).
+        count: how many.
+
+    Returns:
+        (N, min(count, K)) table.
+    """
     places = torch.rand(table.shape, device=table.device).topk(min(count, table.shape[1]), dim=1).indices
     return table.gather(1, places)
 
 
-def neighbourhood(table: Tensor, seeds: Tensor, hops: int) -> tuple[Tensor, Tensor, Tensor]:
-    """The part of a graph on which the states of some nodes depend after as many convolutions.
+def find_neighbourhood(table: Tensor, seeds: Tensor, hops: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Cut out the part of a graph on which the states of some nodes depend after as many convolutions.
 
     PyG's NeighborLoader does this with compiled packages (pyg-lib, torch-sparse) that torch-geometric does not
     bring along; a table needs no more than indexing.
@@ -90,8 +107,8 @@ def neighbourhood(table: Tensor, seeds: Tensor, hops: int) -> tuple[Tensor, Tens
         hops: how many convolutions.
 
     Returns:
-        nodes: (M,) those that matter; the rest numbers them 0 to M - 1.
-        table: (M, K) the graph of these; what lies outside is absent.
+        nodes: (M,) the nodes of that part; the other two results number them 0 to M - 1.
+        table: (M, K) their graph; neighbours outside the part are absent.
         seeds: (B,).
     """
     kept = torch.zeros(len(table), dtype=torch.bool, device=table.device)

@@ -17,7 +17,7 @@ from lightning_pose.errors import ConfigError
 
 __all__ = ["Moments", "Ridge", "Spectrum", "shared_factors"]
 
-_KEPT = 4  # factorisations at a time: with and without the validation frames, for two kinds of features
+_MOST_KEPT = 4  # factorisations: with and without the validation frames, for two kinds of features
 _sharing = ContextVar("_sharing", default=False)
 _factors: OrderedDict[bytes, tuple[Tensor, Tensor]] = OrderedDict()
 
@@ -68,10 +68,10 @@ class Spectrum(NamedTuple):
 
 @contextmanager
 def shared_factors() -> Iterator[None]:
-    """Within it, features are factorised once, however many lambdas or numbers of components follow one another.
+    """Within the block, the same features are factorised once, for any number of lambdas and components.
 
-    The factorisations outlive it, and are found again by what the features hold. One lambda alone is solved faster
-    without, which is why this is not the rule.
+    Factorisations are kept after the block, and found again by the content of the features. It is off by default
+    because a single lambda is solved faster without.
     """
     token = _sharing.set(True)
     try:
@@ -80,14 +80,14 @@ def shared_factors() -> Iterator[None]:
         _sharing.reset(token)
 
 
-def _factorise(gram: Tensor) -> tuple[Tensor, Tensor]:
+def _factorise_gram(gram: Tensor) -> tuple[Tensor, Tensor]:
     """Eigenvalues, ascending, and eigenvectors of a symmetric matrix, given by its upper triangle."""
     if not _sharing.get():
         return torch.linalg.eigh(gram, UPLO="U")
     key = hashlib.blake2b(gram.contiguous().cpu().numpy().data, digest_size=20).digest()
     if key not in _factors:
         _factors[key] = torch.linalg.eigh(gram, UPLO="U")
-        while len(_factors) > _KEPT:
+        while len(_factors) > _MOST_KEPT:
             _factors.popitem(last=False)
     _factors.move_to_end(key)
     return _factors[key]
@@ -102,7 +102,7 @@ class Moments:
 
     Args:
         n_features: D.
-        n_targets: T; 0 serves where only principal components are wanted.
+        n_targets: T; 0 where only principal components are wanted.
     """
 
     def __init__(self, n_features: int, n_targets: int = 0) -> None:
@@ -118,7 +118,7 @@ class Moments:
         return self._n_folded + self._n_rows
 
     def add(self, x: Tensor, y: Tensor) -> None:
-        """Take features (B, D) and targets (B, T) of further frames."""
+        """Add features (B, D) and targets (B, T) of further frames."""
         most = self._sizes[0]
         if not self.count:
             self._rows = x.new_empty(most + 1, sum(self._sizes), dtype=torch.float64)
@@ -132,7 +132,7 @@ class Moments:
             rows = rows[len(taken) :]
 
     def all_reduce(self, total: Callable[[Tensor], Tensor]) -> None:
-        """Join what several processes took, each at least one frame; `total` sums a tensor over all of them."""
+        """Join the moments of several processes, each of one frame or more; `total` sums a tensor over all of them."""
         self._fold()
         count = total(self._mean.new_tensor([self._n_folded]))
         mean = total(self._mean * self._n_folded) / count
@@ -144,8 +144,8 @@ class Moments:
     def ridge(self, lambdas: Sequence[float], components: int | None = None) -> list[Ridge]:
         """Minimise |Y - X W|^2 + lambda |W|^2 (thesis, eq. 5.2) for each lambda; the bias is not penalised.
 
-        One eigendecomposition serves all lambdas and the principal components. A single lambda on all features of
-        many frames takes a Cholesky factorisation, a tenth of its time; not in `shared_factors`, where others follow.
+        All lambdas and principal components use one eigendecomposition. A single lambda on all features of many
+        frames uses a Cholesky factorisation, which takes a tenth of the time, except within `shared_factors`.
 
         Args:
             lambdas: each above 0.
@@ -176,18 +176,19 @@ class Moments:
         if self._n_folded:
             self._fold()
             mean = self._mean
-            values, vectors = _factorise(self._gram)
+            values, vectors = _factorise_gram(self._gram)
         else:
             rows = self._rows[: self._n_rows]
             mean = rows.mean(0)
             x = (rows - mean)[:, : self._sizes[0]]
-            values, vectors = _factorise(x @ x.T)
+            values, vectors = _factorise_gram(x @ x.T)
             # Eigenvectors over frames span those over features, but for what the null space would divide by 0.
             vectors = x.T @ (vectors / values.clamp(min=torch.finfo(values.dtype).tiny).sqrt())
         kept = values > values[-1] * len(values) * torch.finfo(values.dtype).eps
         return Spectrum(values[kept].flip(0), vectors[:, kept].flip(1), mean[: self._sizes[0]])
 
     def _mean_and_cross(self) -> tuple[Tensor, Tensor]:
+        """Mean of features and targets (D + T,), and their centred products (D, T)."""
         if self._n_folded:
             self._fold()
             return self._mean, self._cross
@@ -197,6 +198,7 @@ class Moments:
         return mean, x.T @ y
 
     def _fold(self) -> None:
+        """Add the kept rows to the Gram matrix and the products, and forget them."""
         if not self._n_rows:
             return
         features, n, count = self._sizes[0], self._n_rows, self.count

@@ -1,4 +1,4 @@
-"""Folders on disk -> `Scene`: one module per format; `base` says how to add one."""
+"""Folders on disk to a `Scene`: one module per format; `base` describes how to add one."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["SceneFormat", "known_formats", "load_scene"]
 
 
 def known_formats() -> dict[str, SceneFormat]:
-    """Every format by its name: the `FORMAT` of each module of this package."""
+    """Formats by name: the `FORMAT` of each module of this package."""
     modules = (import_module(f"{__name__}.{info.name}") for info in pkgutil.iter_modules(__path__))
     formats = [module.FORMAT for module in modules if hasattr(module, "FORMAT")]
     return {format.name: format for format in formats}
@@ -33,39 +33,39 @@ def load_scene(
 
     Args:
         root: the scene's folder.
-        format: name of its format; recognised from the files where it is None.
+        format: name of its format; recognised from the files if it is None.
         val_fraction: part of the training frames to validate on, see `splits`; 0 for none.
-        test_fraction: part of all frames to test on, where the format has no official split.
-        val_block: validation frames come in runs of this many at least, where sequences are that long.
+        test_fraction: part of all frames to test on, if the format has no official split.
+        val_block: least number of consecutive validation frames, if sequences are that long.
 
     Returns:
-        the scene with `train`, `val` and `test`; no image has been decoded.
+        the scene with splits `train`, `val` and `test`; no image is decoded.
 
     Raises:
         ConfigError: no format has that name, or a fraction is out of range.
-        DataError: the folder is missing or of no known format, or a file of it is missing or malformed.
+        DataError: the folder is missing or of no known format, or one of its files is missing or malformed.
     """
     root = Path(root).expanduser()
     if not root.is_dir():
         raise DataError(f"{root} is not a folder; give the folder of a scene")
-    scene = _format(root, format).read(root)
+    scene = _choose_scene_format(root, format).read(root)
     source = "official" if scene.splits else "blocks"
     return replace(scene, splits=make_splits(scene, val_fraction, test_fraction, val_block), split_source=source)
 
 
-def _format(root: Path, name: str | None) -> SceneFormat:
-    """The format of that name, or the only one that the folder matches."""
+def _choose_scene_format(root: Path, name: str | None) -> SceneFormat:
+    """The format of that name; without a name, the only one that the folder matches."""
     formats = known_formats()
     if name is not None:
         if name not in formats:
             raise ConfigError(f"format {name!r} is unknown; the formats are {', '.join(sorted(formats))}")
         return formats[name]
-    matching = _matching(root)
+    matching = _find_matching_formats(root)
     if len(matching) > 1:
-        raise DataError(f"{root} may be {' or '.join(matching)}; say which with `format`")
+        raise DataError(f"{root} may be {' or '.join(matching)}; give one of them as `format`")
     if matching:
         return formats[matching[0]]
-    scenes = [child.name for child in sorted(root.iterdir()) if child.is_dir() and _matching(child)]
+    scenes = [child.name for child in sorted(root.iterdir()) if child.is_dir() and _find_matching_formats(child)]
     if scenes:
         raise DataError(f"{root} is no dataset itself but holds {', '.join(scenes)}; give one of these")
     looked = "; ".join(f"{format.name}: {format.looks_for}" for format in formats.values())
@@ -75,5 +75,6 @@ def _format(root: Path, name: str | None) -> SceneFormat:
     )
 
 
-def _matching(root: Path) -> list[str]:
+def _find_matching_formats(root: Path) -> list[str]:
+    """Names of the formats that the folder matches."""
     return [name for name, format in known_formats().items() if format.matches(root)]

@@ -1,4 +1,4 @@
-"""What every format on disk must give, and the reading and checking that several of them share."""
+"""The base class of formats on disk, and functions for reading and checking files that several formats use."""
 
 from __future__ import annotations
 
@@ -16,31 +16,31 @@ from lightning_pose.scenes.scene import Frame, Scene
 
 __all__ = [
     "SceneFormat",
-    "natural_key",
-    "ordered",
-    "poses_from_matrices",
+    "convert_matrices",
+    "make_natural_key",
     "read_lines",
     "read_table",
     "require_images",
+    "sort_frames",
     "unit_quats",
 ]
 
 MAX_SKEW = 1e-2
-"""Largest entry of R^T R - 1 that still counts as rounding; 7-Scenes' own poses reach 3e-4."""
+"""Largest entry of R^T R - 1 that is taken for a rounding error; in 7-Scenes' own poses it is up to 3e-4."""
 
 
 class SceneFormat(ABC):
-    """Reads one layout of posed images; nothing else in the project knows how it looks on disk.
+    """Reads one layout of posed images; no other code depends on how it is stored on disk.
 
-    To add a format, put one module into this package with a subclass that gives
+    To add a format, put one module into this package with a subclass that has
 
     - `name`: what a user writes as `format`;
-    - `looks_for`: the files that give the format away, in words, for messages;
+    - `looks_for`: the files by which the format is recognised, in words, for messages;
     - `matches`: whether a folder is of this format, by the presence of those files, quickly;
-    - `read`: the scene, poses camera-to-world with OpenCV axes, `splits` holding `train` and `test` where
-      the format has an official split and nothing where it has none (`load_scene` makes the rest);
+    - `read`: the scene, with camera-to-world poses in OpenCV axes; `splits` has `train` and `test` if the format has
+      an official split and is empty otherwise (`load_scene` makes the missing splits);
 
-    and an instance of it named `FORMAT`. It is found by itself.
+    and an instance of it named `FORMAT`, which `known_formats` finds.
     """
 
     name: ClassVar[str]
@@ -48,7 +48,7 @@ class SceneFormat(ABC):
 
     @abstractmethod
     def matches(self, root: Path) -> bool:
-        """Whether the folder looks like this format."""
+        """Whether the folder has the files of this format."""
 
     @abstractmethod
     def read(self, root: Path) -> Scene:
@@ -60,7 +60,7 @@ class SceneFormat(ABC):
 
 
 def read_lines(path: Path) -> list[tuple[int, str]]:
-    """The lines that hold data, stripped, with their numbers from 1: no blank lines, no `#` comments.
+    """Read the lines of a text file, stripped, with their numbers from 1, without blank lines and `#` comments.
 
     Raises:
         DataError: the file is missing or is not text.
@@ -76,17 +76,17 @@ def read_lines(path: Path) -> list[tuple[int, str]]:
 
 
 def read_table(path: Path, columns: str) -> tuple[np.ndarray, list[str]]:
-    """A table of finite numbers.
+    """Read a table of finite numbers.
 
     Args:
-        path: text file, one row a line, separated by blanks, tabs or commas.
+        path: text file, one row per line, separated by blanks, tabs or commas.
         columns: names of the columns, for the message.
 
     Returns:
-        (N, number of columns) float64, and N strings `path:line` for later messages.
+        (N, number of columns) float64, and the place of each row, `path:line`, for messages.
 
     Raises:
-        DataError: a line has another number of columns, or an entry is not a finite number.
+        DataError: a line has another number of columns, or an entry that is not a finite number.
     """
     rows, where = [], []
     for number, line in read_lines(path):
@@ -102,14 +102,14 @@ def read_table(path: Path, columns: str) -> tuple[np.ndarray, list[str]]:
     return np.array(rows, dtype=np.float64).reshape(-1, len(columns.split())), where
 
 
-def poses_from_matrices(T_world_cam: np.ndarray, where: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+def convert_matrices(T_world_cam: np.ndarray, where: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
     """Positions and quaternions of (N, 4, 4) camera-to-world matrices.
 
-    A rotation that is off by rounding is replaced by the nearest one (SVD).
+    A matrix that is a rotation except for rounding errors is replaced by the nearest rotation (SVD).
 
     Args:
         T_world_cam: (N, 4, 4).
-        where: the file of each matrix, for messages.
+        where: the file of each matrix, for the message.
 
     Returns:
         (N, 3) positions and (N, 4) unit quaternions wxyz, w >= 0, float64.
@@ -119,58 +119,71 @@ def poses_from_matrices(T_world_cam: np.ndarray, where: Sequence[str]) -> tuple[
             or mirrored.
     """
     finite = np.isfinite(T_world_cam).sum(axis=(1, 2))
-    _refuse(finite < 16, where, T_world_cam, "the pose has NaN or infinite entries ({}); remove the frame")
+    _raise_if_any(finite < 16, where, T_world_cam, "the pose has NaN or infinite entries ({}); remove the frame")
     bottom = T_world_cam[:, 3]
     off = np.abs(bottom - [0, 0, 0, 1]).max(axis=1)
-    _refuse(off > 1e-6, where, bottom, "the last row is {}, not 0 0 0 1; give a 4x4 camera-to-world matrix")
+    _raise_if_any(off > 1e-6, where, bottom, "the last row is {}, not 0 0 0 1; give a 4x4 camera-to-world matrix")
     R = T_world_cam[:, :3, :3]
     det = np.linalg.det(R)
-    _refuse(det < 0, where, det, "the rotation is mirrored (determinant {}); give right-handed axes")
+    _raise_if_any(det < 0, where, det, "the rotation is mirrored (determinant {}); give right-handed axes")
     skew = np.abs(R.swapaxes(1, 2) @ R - np.eye(3)).max(axis=(1, 2))
-    _refuse(skew > MAX_SKEW, where, skew, "the 3x3 is no rotation (R^T R is off by {}); correct the pose")
+    _raise_if_any(skew > MAX_SKEW, where, skew, "the 3x3 is no rotation (R^T R is off by {}); correct the pose")
     U, _, Vt = np.linalg.svd(R)
-    return T_world_cam[:, :3, 3], _canonical(Rotation.from_matrix(U @ Vt))
+    return T_world_cam[:, :3, 3], _make_canonical_quats(Rotation.from_matrix(U @ Vt))
 
 
 def unit_quats(quats: np.ndarray, where: Sequence[str], scalar_first: bool) -> np.ndarray:
-    """(N, 4) unit quaternions wxyz, w >= 0, of (N, 4) finite quaternions as a file has them.
+    """Normalise (N, 4) finite quaternions of a file; return unit quaternions wxyz with w >= 0.
+
+    Args:
+        quats: as the file has them.
+        where: the place of each in the file, for the message.
+        scalar_first: whether the file has wxyz; otherwise xyzw.
 
     Raises:
-        DataError: a norm is more than 10 % off 1, far beyond rounding: those are not quaternions.
+        DataError: a norm differs from 1 by more than 10 %, more than rounding errors can explain.
     """
     norms = np.linalg.norm(quats, axis=1)
     off = np.abs(norms - 1)
-    _refuse(off > 0.1, where, norms, "the quaternion's norm is {}, not 1; check the order of the columns")
-    return _canonical(Rotation.from_quat(quats, scalar_first=scalar_first))
+    _raise_if_any(off > 0.1, where, norms, "the quaternion's norm is {}, not 1; check the order of the columns")
+    return _make_canonical_quats(Rotation.from_quat(quats, scalar_first=scalar_first))
 
 
 def require_images(paths: Iterable[Path], listed_in: str) -> None:
-    """Raise ImageError, naming the first and the number of them, if listed images are missing."""
+    """Check that all images exist.
+
+    Args:
+        paths: image files.
+        listed_in: the file that lists them, for the message.
+
+    Raises:
+        ImageError: images are missing; the message names the first and how many there are.
+    """
     missing = [path for path in paths if not path.is_file()]
     if missing:
         raise ImageError(
             f"{missing[0]} is missing, listed in {listed_in} ({len(missing)} such images); "
-            "unpack the images there or take them off the list"
+            "unpack the images there or remove them from the list"
         )
 
 
-def natural_key(text: str) -> list[tuple[int, str]]:
-    """Sort key that puts `seq2` before `seq10`."""
+def make_natural_key(text: str) -> list[tuple[int, str]]:
+    """Key for sorting by the numbers in a text: `seq2` comes before `seq10`."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", text)]
 
 
-def ordered(frames: Iterable[Frame]) -> tuple[Frame, ...]:
-    """Frames in the order that a Scene wants: sequence by sequence, by index within each."""
-    return tuple(sorted(frames, key=lambda frame: (natural_key(frame.sequence), frame.index)))
+def sort_frames(frames: Iterable[Frame]) -> tuple[Frame, ...]:
+    """Sort frames as a `Scene` needs them: by sequence, and by index within each sequence."""
+    return tuple(sorted(frames, key=lambda frame: (make_natural_key(frame.sequence), frame.index)))
 
 
-def _canonical(rotation: Rotation) -> np.ndarray:
-    """w >= 0: q and -q are one rotation, and comparing files must not depend on which one was written."""
+def _make_canonical_quats(rotation: Rotation) -> np.ndarray:
+    """Quaternions wxyz with w >= 0: of q and -q, always the same one, whichever the file has."""
     return rotation.as_quat(canonical=True, scalar_first=True)
 
 
-def _refuse(bad: np.ndarray, where: Sequence[str], values: np.ndarray, complaint: str) -> None:
-    """Raise DataError with the place and the value of the first bad row, if there is one."""
+def _raise_if_any(bad: np.ndarray, where: Sequence[str], values: np.ndarray, complaint: str) -> None:
+    """Raise a DataError with the place and the value of the first bad row, if there is one."""
     for i in np.flatnonzero(bad)[:1]:
         value = np.array2string(values[i], precision=6).replace("\n", "")
         raise DataError(f"{where[i]}: {complaint.format(value)}")

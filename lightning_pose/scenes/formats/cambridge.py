@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lightning_pose.errors import DataError
-from lightning_pose.scenes.formats.base import SceneFormat, ordered, read_lines, require_images, unit_quats
+from lightning_pose.scenes.formats.base import SceneFormat, read_lines, require_images, sort_frames, unit_quats
 from lightning_pose.scenes.scene import Frame, Scene
 
 __all__ = ["FORMAT", "Cambridge"]
@@ -20,6 +20,7 @@ log = logging.getLogger("lightning_pose")
 SPLIT_FILES = {"train": "dataset_train.txt", "test": "dataset_test.txt"}
 HEADER_LINES = 3
 MAX_DISTANCE_M = 10_000.0
+"""Poses farther than this from the median position are dropped."""
 
 
 class Cambridge(SceneFormat):
@@ -27,7 +28,7 @@ class Cambridge(SceneFormat):
 
     xyz is the camera centre in the world, metres; the quaternion is world-to-camera, w first, and is
     inverted here. The image's folder is its sequence. Poses more than 10 km from the median of all
-    positions are failures of the reconstruction: they are dropped with a warning.
+    positions are errors of the reconstruction; they are dropped with a warning.
     """
 
     name = "cambridge"
@@ -37,8 +38,8 @@ class Cambridge(SceneFormat):
         return all((root / file).is_file() for file in SPLIT_FILES.values())
 
     def read(self, root: Path) -> Scene:
-        rows = {split: _read_list(root / file) for split, file in SPLIT_FILES.items()}
-        frames, split_of = _frames(root, rows)
+        rows = {split: _read_pose_list(root / file) for split, file in SPLIT_FILES.items()}
+        frames, split_of = _make_frames(root, rows)
         splits = {
             split: np.array([i for i, frame in enumerate(frames) if split_of[frame.image] == split], dtype=int)
             for split in SPLIT_FILES
@@ -52,10 +53,11 @@ class Cambridge(SceneFormat):
 FORMAT = Cambridge()
 
 Row = tuple[str, list[float], str]
-"""Image, its seven numbers, and the place in the file."""
+"""An image, its seven numbers, and its place in the file."""
 
 
-def _read_list(path: Path) -> list[Row]:
+def _read_pose_list(path: Path) -> list[Row]:
+    """Read the rows of a split's file."""
     rows = []
     for number, line in read_lines(path):
         if number <= HEADER_LINES:
@@ -74,8 +76,8 @@ def _read_list(path: Path) -> list[Row]:
     return rows
 
 
-def _frames(root: Path, rows: dict[str, list[Row]]) -> tuple[tuple[Frame, ...], dict[Path, str]]:
-    """The frames of both lists, ordered, and the split of each image."""
+def _make_frames(root: Path, rows: dict[str, list[Row]]) -> tuple[tuple[Frame, ...], dict[Path, str]]:
+    """Make the frames of both lists, sorted, and find the split of each image."""
     split_of: dict[Path, str] = {}
     for split, listed in rows.items():
         for image, _, place in listed:
@@ -86,16 +88,14 @@ def _frames(root: Path, rows: dict[str, list[Row]]) -> tuple[tuple[Frame, ...], 
     poses = np.array([pose for _, pose, _ in listed]).reshape(-1, 7)
     quats = unit_quats(poses[:, 3:], [place for *_, place in listed], scalar_first=True)
     quats = Rotation.from_quat(quats, scalar_first=True).inv().as_quat(canonical=True, scalar_first=True)
-    kept = _near_median(root, poses[:, :3])
-    frames = [
-        Frame(root / listed[i][0], poses[i, :3], quats[i], *_sequence_and_index(root, listed[i][0])) for i in kept
-    ]
+    kept = _keep_near_median(root, poses[:, :3])
+    frames = [Frame(root / listed[i][0], poses[i, :3], quats[i], *_parse_image_path(root, listed[i][0])) for i in kept]
     require_images((frame.image for frame in frames), " or ".join(SPLIT_FILES.values()))
-    return ordered(frames), split_of
+    return sort_frames(frames), split_of
 
 
-def _near_median(root: Path, positions_m: np.ndarray) -> np.ndarray:
-    """Rows within MAX_DISTANCE_M of the median position."""
+def _keep_near_median(root: Path, positions_m: np.ndarray) -> np.ndarray:
+    """Rows within MAX_DISTANCE_M of the median position; warn if others are dropped."""
     if not len(positions_m):
         return np.array([], dtype=int)
     distance = np.linalg.norm(positions_m - np.median(positions_m, axis=0), axis=1)
@@ -106,8 +106,8 @@ def _near_median(root: Path, positions_m: np.ndarray) -> np.ndarray:
     return kept
 
 
-def _sequence_and_index(root: Path, image: str) -> tuple[str, int]:
-    """`seq1/frame00012.png` -> `seq1`, 12."""
+def _parse_image_path(root: Path, image: str) -> tuple[str, int]:
+    """Sequence and frame number of an image path: `seq1`, 12 of `seq1/frame00012.png`."""
     path = PurePosixPath(image)
     number = re.search(r"\d+", path.stem)
     folder = path.parent.as_posix()

@@ -1,4 +1,4 @@
-"""Microsoft 7-Scenes (Shotton et al., CVPR 2013), and the synthetic room that is written in its layout."""
+"""Microsoft 7-Scenes (Shotton et al., CVPR 2013), and the synthetic room, which is written in the same layout."""
 
 from __future__ import annotations
 
@@ -9,22 +9,23 @@ from pathlib import Path
 import numpy as np
 
 from lightning_pose.errors import DataError
-from lightning_pose.scenes.formats.base import SceneFormat, ordered, poses_from_matrices, read_lines
+from lightning_pose.scenes.formats.base import SceneFormat, convert_matrices, read_lines, sort_frames
 from lightning_pose.scenes.scene import Frame, Intrinsics, Scene
 
 __all__ = ["FORMAT", "SevenScenes"]
 
 SPLIT_FILES = {"train": "TrainSplit.txt", "test": "TestSplit.txt"}
 COLOUR = Intrinsics(fx=525.0, fy=525.0, cx=320.0, cy=240.0)
+"""Nominal values of the Kinect's colour camera, in pixels."""
 FRAME_FILE = re.compile(r"frame-(\d+)\.(?:(color\.(?:png|jpe?g))|(pose\.txt))")
 
 
 class SevenScenes(SceneFormat):
-    """`TrainSplit.txt` and `TestSplit.txt` list `sequenceN`, which is the folder `seq-NN`.
+    """`TrainSplit.txt` and `TestSplit.txt` list sequences as `sequenceN`, the folder `seq-NN`.
 
     Each sequence holds `frame-NNNNNN.color.png` (or jpg) and `frame-NNNNNN.pose.txt`, the 4x4
-    camera-to-world matrix in metres, OpenCV axes. A file `synthetic.json` marks a rendered room and gives
-    its camera as `intrinsics`: `fx`, `fy`, `cx`, `cy`; the camera of the real scenes is Kinect's nominal one.
+    camera-to-world matrix in metres, OpenCV axes. A rendered room has a file `synthetic.json` with
+    its camera as `intrinsics`: `fx`, `fy`, `cx`, `cy`; real scenes get the Kinect's nominal values.
     """
 
     name = "7scenes"
@@ -34,9 +35,9 @@ class SevenScenes(SceneFormat):
         return all((root / file).is_file() for file in SPLIT_FILES.values())
 
     def read(self, root: Path) -> Scene:
-        split_of = _split_of_sequences(root)
-        intrinsics = _intrinsics(root)
-        frames = ordered(frame for sequence in split_of for frame in _read_sequence(root / sequence, intrinsics))
+        split_of = _read_split_files(root)
+        intrinsics = _read_intrinsics(root)
+        frames = sort_frames(frame for sequence in split_of for frame in _read_sequence(root / sequence, intrinsics))
         splits = {
             split: np.array([i for i, frame in enumerate(frames) if split_of[frame.sequence] == split])
             for split in SPLIT_FILES
@@ -48,8 +49,8 @@ class SevenScenes(SceneFormat):
 FORMAT = SevenScenes()
 
 
-def _split_of_sequences(root: Path) -> dict[str, str]:
-    """Folder name of each listed sequence -> its split."""
+def _read_split_files(root: Path) -> dict[str, str]:
+    """The split of each listed sequence, by the name of its folder."""
     split_of: dict[str, str] = {}
     for split, file in SPLIT_FILES.items():
         lines = read_lines(root / file)
@@ -73,7 +74,7 @@ def _split_of_sequences(root: Path) -> dict[str, str]:
 
 
 def _read_sequence(folder: Path, intrinsics: Intrinsics) -> list[Frame]:
-    """The frames of one sequence, in no particular order."""
+    """Read the frames of one sequence, in no particular order."""
     images: dict[int, Path] = {}
     poses: dict[int, Path] = {}
     for path in folder.iterdir():
@@ -86,7 +87,7 @@ def _read_sequence(folder: Path, intrinsics: Intrinsics) -> list[Frame]:
             raise DataError(f"{images[index]} has no .pose.txt beside it; add it or drop the image")
         raise DataError(f"{poses[index]} has no image beside it; add it or drop the pose")
     where = [str(poses[index]) for index in images]
-    positions, quats = poses_from_matrices(np.stack([_read_matrix(poses[i]) for i in images]), where)
+    positions, quats = convert_matrices(np.stack([_read_matrix(poses[i]) for i in images]), where)
     return [
         Frame(path, position, quat, folder.name, index, intrinsics=intrinsics)
         for (index, path), position, quat in zip(images.items(), positions, quats, strict=True)
@@ -94,15 +95,16 @@ def _read_sequence(folder: Path, intrinsics: Intrinsics) -> list[Frame]:
 
 
 def _read_matrix(path: Path) -> np.ndarray:
-    """(4, 4) float64."""
+    """Read a pose file, (4, 4) float64."""
     try:
-        # Thousands of these are read: np.loadtxt is forty times slower.
+        # np.loadtxt is forty times slower, and a scene has thousands of these files.
         return np.array(path.read_text().split(), dtype=np.float64).reshape(4, 4)
     except ValueError as error:
         raise DataError(f"{path}: not a 4x4 matrix of numbers ({error}); restore the original") from error
 
 
-def _intrinsics(root: Path) -> Intrinsics:
+def _read_intrinsics(root: Path) -> Intrinsics:
+    """Read the camera of a rendered room; of any other folder it is that of 7-Scenes."""
     path = root / "synthetic.json"
     if not path.is_file():
         return COLOUR
@@ -110,4 +112,4 @@ def _intrinsics(root: Path) -> Intrinsics:
         camera = json.loads(path.read_text())["intrinsics"]
         return Intrinsics(**{name: float(camera[name]) for name in ("fx", "fy", "cx", "cy")})
     except (ValueError, KeyError, TypeError) as error:
-        raise DataError(f"{path}: no `intrinsics` of fx, fy, cx, cy ({error!r}); render it anew") from error
+        raise DataError(f"{path}: no `intrinsics` of fx, fy, cx, cy ({error!r}); render the room again") from error

@@ -1,4 +1,4 @@
-"""TUM RGB-D (Sturm et al., IROS 2012): an image list and a trajectory, each with its own clock readings."""
+"""TUM RGB-D (Sturm et al., IROS 2012): an image list and a trajectory, each with its own timestamps."""
 
 from __future__ import annotations
 
@@ -11,18 +11,20 @@ from lightning_pose.errors import DataError
 from lightning_pose.scenes.formats.base import SceneFormat, read_lines, read_table, require_images, unit_quats
 from lightning_pose.scenes.scene import Frame, Intrinsics, Scene
 
-__all__ = ["FORMAT", "TRAJECTORY_COLUMNS", "Tum", "associate", "is_numbered"]
+__all__ = ["FORMAT", "TRAJECTORY_COLUMNS", "Tum", "is_numbered", "pair_by_time"]
 
 log = logging.getLogger("lightning_pose")
 
 TRAJECTORY_COLUMNS = "timestamp tx ty tz qx qy qz qw"
 MAX_DIFFERENCE_S = 0.02
+"""Largest difference in time between an image and its pose."""
+
 CAMERAS = {
     "freiburg1": Intrinsics(fx=517.3, fy=516.5, cx=318.6, cy=255.3),
     "freiburg2": Intrinsics(fx=520.9, fy=521.0, cx=325.1, cy=249.7),
     "freiburg3": Intrinsics(fx=535.4, fy=539.2, cx=320.1, cy=247.6),
 }
-"""The calibrated colour cameras of the benchmark, known by the folder's name."""
+"""The calibrated colour cameras of the benchmark, by a part of the folder's name."""
 
 
 class Tum(SceneFormat):
@@ -40,13 +42,14 @@ class Tum(SceneFormat):
         return (root / "rgb.txt").is_file() and trajectory.is_file() and not is_numbered(trajectory)
 
     def read(self, root: Path) -> Scene:
-        times, images = _read_list(root / "rgb.txt")
+        times, images = _read_image_list(root / "rgb.txt")
         table, where = read_table(root / "groundtruth.txt", TRAJECTORY_COLUMNS)
-        pairs = associate(times, table[:, 0])
+        pairs = pair_by_time(times, table[:, 0])
         if not len(pairs):
             raise DataError(
                 f"{root}: none of the {len(times)} images has a pose within 20 ms; "
-                f"rgb.txt spans {_span(times)}, groundtruth.txt {_span(table[:, 0])}; bring both to one clock"
+                f"rgb.txt spans {_format_span(times)}, groundtruth.txt {_format_span(table[:, 0])}; "
+                "bring both to one clock"
             )
         if len(pairs) < len(times):
             log.warning("%s: dropped %d of %d images, no pose within 20 ms", root, len(times) - len(pairs), len(times))
@@ -64,7 +67,7 @@ class Tum(SceneFormat):
 FORMAT = Tum()
 
 
-def associate(times: np.ndarray, pose_times: np.ndarray) -> np.ndarray:
+def pair_by_time(times: np.ndarray, pose_times: np.ndarray) -> np.ndarray:
     """Pair images with poses by time: the closest pairs first, each image and each pose at most once.
 
     Args:
@@ -72,7 +75,7 @@ def associate(times: np.ndarray, pose_times: np.ndarray) -> np.ndarray:
         pose_times: (M,) seconds, in any order.
 
     Returns:
-        (K, 2) rows of the image and of the pose, in the images' order, at most 20 ms apart.
+        (K, 2) pairs of an image's row and a pose's row, in the order of the images, at most 20 ms apart.
     """
     order = np.argsort(pose_times, kind="stable")
     first = np.searchsorted(pose_times[order], times - MAX_DIFFERENCE_S, side="left")
@@ -89,15 +92,15 @@ def associate(times: np.ndarray, pose_times: np.ndarray) -> np.ndarray:
 
 
 def is_numbered(trajectory: Path) -> bool:
-    """Whether the first column counts frames (0, 1, 2, ... or 1, 2, 3, ...) in place of telling the time."""
+    """Whether the first column counts frames (0, 1, 2, ... or 1, 2, 3, ...) and has no times."""
     numbers = [line.split()[0] for _, line in read_lines(trajectory)]
     return numbers[:1] in (["0"], ["1"]) and all(
         number == str(int(numbers[0]) + row) for row, number in enumerate(numbers)
     )
 
 
-def _read_list(path: Path) -> tuple[np.ndarray, list[str]]:
-    """Times in seconds, ascending, and the image paths as listed."""
+def _read_image_list(path: Path) -> tuple[np.ndarray, list[str]]:
+    """Read the image list: times in seconds, ascending, and the paths as listed, in the same order."""
     entries = []
     for number, line in read_lines(path):
         try:
@@ -111,5 +114,6 @@ def _read_list(path: Path) -> tuple[np.ndarray, list[str]]:
     return np.array([time for time, _ in entries]), [image for _, image in entries]
 
 
-def _span(times: np.ndarray) -> str:
+def _format_span(times: np.ndarray) -> str:
+    """First and last time, in words."""
     return f"{times.min():.3f} to {times.max():.3f} s" if len(times) else "nothing"

@@ -1,5 +1,8 @@
-"""A room that needs no download: `textures` and `posters` paint it, `room` builds and lights it,
-`trajectory` walks through it, `render` draws it, `dataset` writes it in 7-Scenes layout."""
+"""A synthetic dataset that needs no download: images of a furnished room.
+
+`textures` and `posters` make the textures, `room` the surfaces and their light, `trajectory` the camera's paths,
+`render` the images, `dataset` the files.
+"""
 
 from lightning_pose.scenes.synthetic.dataset import RENDERER_VERSION, render_room
 

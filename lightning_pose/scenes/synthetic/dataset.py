@@ -14,20 +14,20 @@ import cv2
 import numpy as np
 
 from lightning_pose.errors import ConfigError, DataError
-from lightning_pose.scenes.synthetic.render import Renderer, pinhole
+from lightning_pose.scenes.synthetic.render import Renderer, make_camera
 from lightning_pose.scenes.synthetic.room import make_room
 from lightning_pose.scenes.synthetic.trajectory import Walk, is_test, make_walks
 
-__all__ = ["METADATA", "MIN_FRAMES", "RENDERER_VERSION", "render_room", "sequence_lengths"]
+__all__ = ["METADATA", "MIN_FRAMES", "RENDERER_VERSION", "divide_frames", "render_room"]
 
 METADATA = "synthetic.json"
 RENDERER_VERSION = 1
-"""Goes up whenever the same seed gives other images or poses."""
+"""Raised whenever the same seed gives other images or poses."""
 
 MIN_FRAMES = 6
 SMALLEST, LARGEST = (64, 48), (1920, 1440)
 SHUTTER = 0.25
-"""The part of the time between two frames that the shutter is open for."""
+"""Fraction of the time between two frames during which the shutter is open."""
 
 
 def render_room(
@@ -40,12 +40,12 @@ def render_room(
     """Render a textured room along hand-held trajectories, in 7-Scenes layout.
 
     The same arguments give the same bytes. The images are rendered into a hidden sibling folder that is
-    renamed at the end, so `root` is either absent or complete, even if several processes ask for it at
-    once. A `root` that already holds this very room is returned as it is.
+    renamed at the end, so `root` is either absent or complete, even if several processes render it at once.
+    If `root` already holds the room with these arguments, it is returned unchanged.
 
     Args:
         root: folder to write.
-        seed: which room; each has its own dimensions, surfaces, furniture, pictures and trajectories.
+        seed: number of the room; each has its own dimensions, surfaces, furniture, pictures and trajectories.
         frames: number of images, over all sequences.
         size: width and height of the images, in pixels.
         progress: called with the number of images written and the total, after each.
@@ -58,16 +58,16 @@ def render_room(
         ConfigError: seed, frames or size is out of range.
         DataError: root holds something else, or cannot be written.
     """
-    _check(seed, frames, size)
+    _check_arguments(seed, frames, size)
     root = Path(root)
     metadata = {
         "seed": seed,
         "frames": frames,
         "size": list(size),
         "renderer_version": RENDERER_VERSION,
-        "intrinsics": asdict(pinhole(size)),
+        "intrinsics": asdict(make_camera(size)),
     }
-    if _holds(root, metadata):
+    if _holds_room(root, metadata):
         return root
     try:
         root.parent.mkdir(parents=True, exist_ok=True)
@@ -78,21 +78,22 @@ def render_room(
             try:
                 partial.rename(root)
             except OSError:
-                # Another process may have finished the same room first; then its copy is as good.
-                if not _holds(root, metadata):
+                # Another process may have finished the same room first; its files are the same.
+                if not _holds_room(root, metadata):
                     raise
     except OSError as error:
         raise DataError(f"cannot write the room to {root}: {error}; give a folder that can be written") from error
     return root
 
 
-def sequence_lengths(frames: int) -> list[int]:
+def divide_frames(frames: int) -> list[int]:
     """Frames per sequence: about 30 up to 300 frames, then ten longer ones, then more of 100."""
     count = max(3, min(10, frames // 30), -(-frames // 100))
     return [len(part) for part in np.array_split(np.arange(frames), count)]
 
 
-def _check(seed: int, frames: int, size: tuple[int, int]) -> None:
+def _check_arguments(seed: int, frames: int, size: tuple[int, int]) -> None:
+    """Raise a ConfigError if an argument of `render_room` is out of range."""
     if seed < 0:
         raise ConfigError(f"seed is {seed}; give a whole number of 0 or more")
     if frames < MIN_FRAMES:
@@ -104,8 +105,8 @@ def _check(seed: int, frames: int, size: tuple[int, int]) -> None:
         raise ConfigError(f"size is {size[0]}x{size[1]}; give a width and height from {low} to {high} pixels")
 
 
-def _holds(root: Path, metadata: dict) -> bool:
-    """Whether root holds this very room; False if it is absent or empty.
+def _holds_room(root: Path, metadata: dict) -> bool:
+    """Whether root holds the room of this metadata; False if root is absent or empty.
 
     Raises:
         DataError: root holds anything else.
@@ -126,8 +127,9 @@ def _holds(root: Path, metadata: dict) -> bool:
 def _write_room(
     root: Path, seed: int, frames: int, size: tuple[int, int], progress: Callable[[int, int], None] | None
 ) -> None:
-    room, lengths = make_room(seed), sequence_lengths(frames)
-    renderer = Renderer(room.quads, pinhole(size), size)
+    """Write all files of the room but its metadata; arguments as for `render_room`."""
+    room, lengths = make_room(seed), divide_frames(frames)
+    renderer = Renderer(room.quads, make_camera(size), size)
     walks = make_walks(seed, room.size_m, lengths)
     root.mkdir()
     for name, held_out in (("TrainSplit.txt", False), ("TestSplit.txt", True)):
@@ -138,7 +140,7 @@ def _write_room(
         folder = root / f"seq-{i + 1:02d}"
         folder.mkdir()
         jobs += [(folder, walk, [seed, 2, i], frame) for frame in range(walk.length)]
-    # Threads do: OpenCV and numpy let go of the interpreter's lock, and nothing has to be started or copied.
+    # Threads are enough: OpenCV and numpy release the interpreter's lock, and threads need no copies of the room.
     with ThreadPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
         for done, _ in enumerate(pool.map(lambda job: _write_frame(renderer, *job), jobs), start=1):
             if progress is not None:
@@ -146,9 +148,10 @@ def _write_room(
 
 
 def _write_frame(renderer: Renderer, folder: Path, walk: Walk, seed: list[int], frame: int) -> None:
+    """Write image and pose of a walk's frame; `seed` is that of the sequence."""
     moments = frame + SHUTTER * (np.arange(4) - 1.5) / 4
     image = renderer.render(np.array([walk.pose(moment) for moment in moments]))
-    image = _expose(image, np.random.default_rng([*seed, frame]), np.random.default_rng(seed), frame)
+    image = _add_sensor_effects(image, np.random.default_rng([*seed, frame]), np.random.default_rng(seed), frame)
     stem = folder / f"frame-{frame:06d}"
     ok, png = cv2.imencode(".png", image)
     if not ok:
@@ -157,10 +160,10 @@ def _write_frame(renderer: Renderer, folder: Path, walk: Walk, seed: list[int], 
     np.savetxt(f"{stem}.pose.txt", walk.pose(frame), fmt="%.9f")
 
 
-def _expose(
+def _add_sensor_effects(
     image: np.ndarray, frame_rng: np.random.Generator, sequence_rng: np.random.Generator, frame: int
 ) -> np.ndarray:
-    """The sensor: a gain and white balance that drift along the sequence, shot and read noise, 8 bits."""
+    """Add what a sensor adds: gain and white balance that change along the sequence, shot and read noise, 8 bits."""
     phase, period = sequence_rng.uniform(0, 2 * np.pi, 4), sequence_rng.uniform(40, 120, 4)
     wave = np.sin(phase + 2 * np.pi * frame / period)
     image = image * (1 + 0.08 * wave[0] + 0.02 * wave[1:]).astype(np.float32)

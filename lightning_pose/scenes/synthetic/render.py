@@ -1,4 +1,4 @@
-"""The renderer: textured rectangles through a pinhole camera, with a depth buffer and mip maps."""
+"""The renderer: images of textured rectangles from a pinhole camera, with a depth buffer and mip maps."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from lightning_pose.scenes.scene import Intrinsics
 from lightning_pose.scenes.synthetic.room import Quad
 
-__all__ = ["SUBSAMPLES", "Renderer", "pinhole"]
+__all__ = ["SUBSAMPLES", "Renderer", "make_camera"]
 
 SUBSAMPLES = np.array([(-3, -1), (1, -3), (3, 1), (-1, 3)]) / 8
 """Offsets in pixels at which each pixel is sampled: a rotated grid."""
@@ -19,22 +19,25 @@ _ATLAS_WIDTH = 4096
 _LEVELS = 7
 
 
-def pinhole(size: tuple[int, int]) -> Intrinsics:
-    """The camera of every room: 63 degrees of horizontal view, as in 7-Scenes; pixel centres at integers."""
+def make_camera(size: tuple[int, int]) -> Intrinsics:
+    """Intrinsics for images of a width and height: 63 degrees of horizontal view, as in 7-Scenes.
+
+    Pixel centres have integer coordinates.
+    """
     width, height = size
     focal = 525 / 640 * width
     return Intrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2)
 
 
 class Renderer:
-    """Draws rectangles as a camera sees them.
+    """Renders images of rectangles.
 
     A rectangle's points are c + s*u + t*v. With M = R^T [u, v, c - camera] and a pixel's ray d,
-    M (s, t, 1) = z * d, so M^-1 d = (s, t, 1) / z: three affine functions of the pixel give the inverse depth
-    and, without clipping anything, where the rectangle is: in front, inside its edges, and nearest.
+    M (s, t, 1) = z * d, so M^-1 d = (s, t, 1) / z. These three affine functions of the pixel give the inverse depth,
+    and whether the pixel lies inside the rectangle; nothing has to be clipped.
 
     Args:
-        quads: the scene. A pixel that shows none of them takes the first one's nearest colour.
+        quads: all rectangles. A pixel without any gets the colour of the first one's nearest point.
         camera: the intrinsics.
         size: width and height of the images, in pixels.
     """
@@ -43,14 +46,14 @@ class Renderer:
         self._camera, self._size = camera, size
         self._corners = np.array([q.corner for q in quads])
         self._edges = np.stack([[q.u for q in quads], [q.v for q in quads]], axis=-1)
-        self._atlas, self._places = _pack([_pyramid(q.texture) for q in quads])
+        self._atlas, self._places = _pack_atlas([_build_pyramid(q.texture) for q in quads])
 
     def render(self, T_world_cam: np.ndarray) -> np.ndarray:
-        """One exposure.
+        """Render one image.
 
         Args:
-            T_world_cam: (4, 4, 4) camera-to-world poses at the four moments that the shutter is open
-                for, or (4, 4) for a camera at rest; x right, y down, z forward.
+            T_world_cam: (4, 4, 4) camera-to-world poses at four moments while the shutter is open, or (4, 4) of a
+                camera at rest; x right, y down, z forward.
 
         Returns:
             (H, W, 3) float32 BGR in 0..255, free of noise.
@@ -58,7 +61,7 @@ class Renderer:
         poses = np.broadcast_to(T_world_cam, (len(SUBSAMPLES), 4, 4))
         total = np.zeros((self._size[1], self._size[0], 3), np.float32)
         for k, (pose, offset) in enumerate(zip(poses, SUBSAMPLES, strict=True)):
-            # Each subsample rounds its mip level elsewhere, so that their mean blends the levels.
+            # Each subsample rounds its mip level at another value, so that their mean is a blend of levels.
             cv2.accumulate(self._sample(pose, offset, (k - 1.5) / 4), total)
         return total / len(SUBSAMPLES)
 
@@ -69,9 +72,9 @@ class Renderer:
         y = ((np.arange(height) + offset[1] - self._camera.cy) / self._camera.fy).astype(np.float32)
         rotation, center = pose[:3, :3], pose[:3, 3]
         M = rotation.T @ np.concatenate([self._edges, (self._corners - center)[..., None]], axis=-1)
-        # Positive where the camera is on the visible side; near zero where it sees the rectangle edge on.
+        # Positive if the camera is on the visible side; near zero if it is in the plane of the rectangle.
         facing = np.linalg.det(M)
-        windows = _windows(M, x, y)
+        windows = _find_windows(M, x, y)
         visible = np.flatnonzero((facing > 1e-6) & (windows[:, ::2] < windows[:, 1::2]).all(1))
         inverses = np.zeros_like(M)
         inverses[visible] = np.linalg.inv(M[visible])
@@ -80,8 +83,8 @@ class Renderer:
         for q in visible:
             top, bottom, left, right = windows[q]
             window = slice(top, bottom), slice(left, right)
-            s, t, inv_z = _affine(inverses[q], x[window[1]], y[window[0]])
-            slack = 1e-4 * inv_z  # closes the cracks that rounding opens between neighbours
+            s, t, inv_z = _evaluate_affine(inverses[q], x[window[1]], y[window[0]])
+            slack = 1e-4 * inv_z  # closes gaps between adjoining rectangles, which rounding errors cause
             wins = (inv_z > nearest[window]) & (s >= -slack) & (t >= -slack)
             wins &= (s <= inv_z + slack) & (t <= inv_z + slack)
             np.copyto(nearest[window], inv_z, where=wins)
@@ -97,7 +100,7 @@ class Renderer:
         y: np.ndarray,
         dither: float,
     ) -> np.ndarray:
-        """Look every pixel up in the atlas, in the level whose texels are about a pixel wide.
+        """Colours (H, W, 3) uint8 of all pixels, from the texture level whose texels are about a pixel wide.
 
         The map (s, t) of pixels has the Jacobian determinant det(M^-1) z^3 / f^2 (a homography's).
         """
@@ -113,9 +116,13 @@ class Renderer:
         return cv2.remap(self._atlas, map_x, map_y, cv2.INTER_LINEAR)
 
 
-def _windows(M: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """(Q, 4) first and past-last row and column of each rectangle: all of them if it reaches behind the
-    camera, none if it is wholly there."""
+def _find_windows(M: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """The rows and columns of pixels that each rectangle can cover.
+
+    Returns:
+        (Q, 4): first row, last row + 1, first column, last column + 1. They are all rows and columns if the rectangle
+        is partly behind the camera, none if it is wholly behind.
+    """
     corners = M @ np.array([(0, 1, 1, 0), (0, 0, 1, 1), (1, 1, 1, 1)])
     crosses, behind = corners[:, 2].min(1) < 0.01, corners[:, 2].max(1) < 0.01
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -128,13 +135,14 @@ def _windows(M: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.stack(edges, axis=1)
 
 
-def _affine(inverse: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
-    """The three rows of M^-1 (x, y, 1) over a grid of rays."""
+def _evaluate_affine(inverse: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
+    """The three components of M^-1 (x, y, 1), each (len(y), len(x)), over a grid of rays."""
     a = inverse.astype(np.float32)
     return tuple(a[i, 0] * x + (a[i, 1] * y + a[i, 2])[:, None] for i in range(3))
 
 
-def _pyramid(texture: np.ndarray) -> list[np.ndarray]:
+def _build_pyramid(texture: np.ndarray) -> list[np.ndarray]:
+    """The texture in _LEVELS sizes, each half as wide and high as the one before."""
     levels = [texture]
     for _ in range(_LEVELS - 1):
         h, w = levels[-1].shape[:2]
@@ -142,8 +150,8 @@ def _pyramid(texture: np.ndarray) -> list[np.ndarray]:
     return levels
 
 
-def _pack(pyramids: list[list[np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    """One image that holds every level of every texture, tallest first on shelves, and where they lie.
+def _pack_atlas(pyramids: list[list[np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """Place every level of every texture in one image: in rows from left to right, the highest first.
 
     Returns:
         the atlas, and (Q, _LEVELS, 4) float32: left, top, width and height of each level.

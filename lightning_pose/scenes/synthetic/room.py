@@ -1,7 +1,7 @@
-"""The synthetic room: which textured rectangles it is made of, and the light baked into them.
+"""The synthetic room: the textured rectangles of its walls, furniture and pictures, with light in their textures.
 
-The world's origin is the middle of the floor; x runs along the longer walls, y towards the wall that the
-camera mostly looks at, z up; metres.
+The world's origin is the middle of the floor; x points along the longer walls, y to the wall that the camera mostly
+looks at, z up; metres.
 """
 
 from __future__ import annotations
@@ -14,11 +14,13 @@ import cv2
 import numpy as np
 
 from lightning_pose.scenes.synthetic import textures
-from lightning_pose.scenes.synthetic.posters import poster
+from lightning_pose.scenes.synthetic.posters import paint_poster
 
 __all__ = ["TEXELS_PER_M", "Quad", "Room", "make_room"]
 
 TEXELS_PER_M = 256
+"""Pixels of a texture per metre."""
+
 Paint = Callable[[np.random.Generator, int, int], np.ndarray]
 RIGHT = {
     "-y": (1, 0, 0),
@@ -29,12 +31,12 @@ RIGHT = {
     "-z": (1, 0, 0),
 }
 DOWN = {"+z": (0, -1, 0), "-z": (0, 1, 0)}
-"""A surface's texture axes by the axis that it faces; whatever faces sideways hangs upright."""
+"""World axes of a texture's rows and columns by the direction that a surface faces; columns of walls point down."""
 
 
 @dataclass(frozen=True)
 class Quad:
-    """A textured rectangle, seen from one side: there u points right and v down.
+    """A textured rectangle, visible from one side, from which u points right and v down.
 
     Attributes:
         corner: (3,) world position of the texture's top left corner.
@@ -51,52 +53,52 @@ class Quad:
 
 @dataclass(frozen=True)
 class Room:
-    """Everything that can be seen, and (3,) the room's extent along x, y and z."""
+    """All rectangles of a room, and its extent (3,) along x, y and z in metres."""
 
     quads: tuple[Quad, ...]
     size_m: np.ndarray
 
 
 def make_room(seed: int) -> Room:
-    """Furnish the room of one seed: dimensions, surfaces, furniture, pictures and lamps are all its own."""
+    """Make the room of a seed, which chooses dimensions, surfaces, furniture, pictures and lamps."""
     rng = np.random.default_rng([seed, 0])
     size = rng.uniform((5.4, 3.8, 2.5), (6.6, 4.4, 2.9))
-    boxes = _furniture(rng, size)
+    boxes = _place_furniture(rng, size)
     lamps = np.array([(-size[0] / 4, 0.1, size[2] - 0.15), (size[0] / 4, -0.3, size[2] - 0.15)])
     lamps += rng.uniform(-0.5, 0.5, (2, 3)) * (1, 1, 0)
-    bare = [*_shell(rng, size), *_pictures(rng, size)]
+    bare = [*_make_shell(rng, size), *_hang_pictures(rng, size)]
     for box in boxes:
-        bare += _box_faces(rng, *box)
-    return Room(tuple(_lit(quad, size, np.array(boxes), lamps) for quad in bare), size)
+        bare += _make_box_faces(rng, *box)
+    return Room(tuple(_bake_light(quad, size, np.array(boxes), lamps) for quad in bare), size)
 
 
-def _face(
+def _make_face(
     rng: np.random.Generator, paint: Paint, center: np.ndarray, facing: str, width_m: float, height_m: float
 ) -> Quad:
-    """A rectangle of a size around a centre, its visible side facing along a world axis."""
+    """Make a rectangle of a size around a centre; its visible side faces along a world axis."""
     u, v = width_m * np.array(RIGHT[facing]), height_m * np.array(DOWN.get(facing, (0, 0, -1)))
     texture = paint(rng, round(height_m * TEXELS_PER_M), round(width_m * TEXELS_PER_M))
     return Quad(center - u / 2 - v / 2, u, v, texture)
 
 
-def _shell(rng: np.random.Generator, size: np.ndarray) -> Iterator[Quad]:
-    """Walls, floor, ceiling and a rug."""
+def _make_shell(rng: np.random.Generator, size: np.ndarray) -> Iterator[Quad]:
+    """Make walls, floor, ceiling and a rug."""
     x, y, z = size
-    main, side = textures.bricks, textures.wallpaper
+    main, side = textures.paint_bricks, textures.paint_wallpaper
     if rng.random() < 0.5:
         main, side = side, main
-    floor = textures.planks if rng.random() < 0.5 else textures.tiles
-    yield _face(rng, main, np.array([0, y / 2, z / 2]), "-y", x, z)
-    yield _face(rng, main, np.array([0, -y / 2, z / 2]), "+y", x, z)
-    yield _face(rng, side, np.array([x / 2, 0, z / 2]), "-x", y, z)
-    yield _face(rng, side, np.array([-x / 2, 0, z / 2]), "+x", y, z)
-    yield _face(rng, floor, np.array([0, 0, 0]), "+z", x, y)
-    yield _face(rng, textures.panels, np.array([0, 0, z]), "-z", x, y)
-    yield _face(rng, textures.rug, np.array([rng.uniform(-0.5, 0.5), 0.1, 0.006]), "+z", 2.8, 1.6)
+    floor = textures.paint_planks if rng.random() < 0.5 else textures.paint_tiles
+    yield _make_face(rng, main, np.array([0, y / 2, z / 2]), "-y", x, z)
+    yield _make_face(rng, main, np.array([0, -y / 2, z / 2]), "+y", x, z)
+    yield _make_face(rng, side, np.array([x / 2, 0, z / 2]), "-x", y, z)
+    yield _make_face(rng, side, np.array([-x / 2, 0, z / 2]), "+x", y, z)
+    yield _make_face(rng, floor, np.array([0, 0, 0]), "+z", x, y)
+    yield _make_face(rng, textures.paint_panels, np.array([0, 0, z]), "-z", x, y)
+    yield _make_face(rng, textures.paint_rug, np.array([rng.uniform(-0.5, 0.5), 0.1, 0.006]), "+z", 2.8, 1.6)
 
 
-def _pictures(rng: np.random.Generator, size: np.ndarray) -> Iterator[Quad]:
-    """One or two pictures in each slot of about a metre along every wall."""
+def _hang_pictures(rng: np.random.Generator, size: np.ndarray) -> Iterator[Quad]:
+    """Make one picture, or two above each other, on each metre of every wall."""
     x, y, z = size
     for facing, wall, length in (
         ("-y", np.array([0, y / 2 - 0.01, 0]), x),
@@ -112,11 +114,15 @@ def _pictures(rng: np.random.Generator, size: np.ndarray) -> Iterator[Quad]:
                 along = (left + right) / 2 + rng.uniform(-0.5, 0.5) * (right - left - w)
                 height = (low + high) / 2 + rng.uniform(-0.5, 0.5) * (high - low - h)
                 center = wall + along * np.array(RIGHT[facing]) + (0, 0, height)
-                yield _face(rng, poster, center, facing, w, h)
+                yield _make_face(rng, paint_poster, center, facing, w, h)
 
 
-def _furniture(rng: np.random.Generator, size: np.ndarray) -> list[np.ndarray]:
-    """Boxes, (2, 3) lowest and highest corner: along the far wall, along both side walls, and upon those."""
+def _place_furniture(rng: np.random.Generator, size: np.ndarray) -> list[np.ndarray]:
+    """Choose boxes along the far wall and both side walls, and smaller boxes upon them.
+
+    Returns:
+        arrays (2, 3): lowest and highest corner of each box.
+    """
     x, y, _ = size
     standing: list[np.ndarray] = []
     at = -x / 2 + 0.05
@@ -143,26 +149,26 @@ def _furniture(rng: np.random.Generator, size: np.ndarray) -> list[np.ndarray]:
     return standing + upon
 
 
-def _box_faces(rng: np.random.Generator, low: np.ndarray, high: np.ndarray) -> Iterator[Quad]:
-    """Four sides of one material, and a top."""
+def _make_box_faces(rng: np.random.Generator, low: np.ndarray, high: np.ndarray) -> Iterator[Quad]:
+    """Make the four sides of a box, of one material, and its top."""
     middle, (w, d, h) = (low + high) / 2, high - low
     if low[2] > 0:
-        front: Paint = textures.carton
+        front: Paint = textures.paint_carton
     elif h > 1.2:
-        front = textures.bookshelf
+        front = textures.paint_bookshelf
     else:
-        front = textures.drawers if rng.random() < 0.7 else textures.bookshelf
+        front = textures.paint_drawers if rng.random() < 0.7 else textures.paint_bookshelf
     for facing, face, width in (("-y", low, w), ("+y", high, w), ("-x", low, d), ("+x", high, d)):
         axis = "xy".index(facing[1])
         center = middle.copy()
         center[axis] = face[axis]
-        yield _face(rng, front, center, facing, width, h)
-    top = textures.carton if low[2] > 0 else textures.planks
-    yield _face(rng, top, np.array([middle[0], middle[1], high[2]]), "+z", w, d)
+        yield _make_face(rng, front, center, facing, width, h)
+    top = textures.paint_carton if low[2] > 0 else textures.paint_planks
+    yield _make_face(rng, top, np.array([middle[0], middle[1], high[2]]), "+z", w, d)
 
 
-def _lit(quad: Quad, size: np.ndarray, boxes: np.ndarray, lamps: np.ndarray) -> Quad:
-    """The rectangle with its light baked in: lamps behind soft shadows, and darker corners.
+def _bake_light(quad: Quad, size: np.ndarray, boxes: np.ndarray, lamps: np.ndarray) -> Quad:
+    """Multiply a rectangle's texture by its light: two lamps with soft shadows, and darker corners.
 
     The light is computed on a grid of about 8 points a metre and interpolated.
     """
@@ -172,19 +178,19 @@ def _lit(quad: Quad, size: np.ndarray, boxes: np.ndarray, lamps: np.ndarray) -> 
     normal = np.cross(quad.v, quad.u)
     normal /= np.linalg.norm(normal)
     points = quad.corner + s[..., None] * quad.u + t[..., None] * quad.v
-    light = 0.45 * _openness(points + 0.1 * normal, size, boxes)
+    light = 0.45 * _compute_openness(points + 0.1 * normal, size, boxes)
     softness = 0.25 * np.array([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0)])
     rays = (lamps[:, None] + softness).reshape(-1, 3) - points[..., None, :]
     distance = np.linalg.norm(rays, axis=-1)
     incidence = np.clip((rays @ normal) / distance, 0, 1)
-    reaches = ~_blocked(points[..., None, :] + 0.01 * normal, rays, boxes)
+    reaches = ~_find_blocked(points[..., None, :] + 0.01 * normal, rays, boxes)
     light += (0.145 * reaches * incidence / (0.35 + 0.1 * distance**2)).sum(-1)
     shade = cv2.resize(light.astype(np.float32), (w, h), interpolation=cv2.INTER_LINEAR)
-    return Quad(quad.corner, quad.u, quad.v, textures.shaded(quad.texture, shade))
+    return Quad(quad.corner, quad.u, quad.v, textures.shade_image(quad.texture, shade))
 
 
-def _openness(points: np.ndarray, size: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-    """In 0..1, smaller near walls and boxes: a stand-in for ambient occlusion."""
+def _compute_openness(points: np.ndarray, size: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+    """Ambient light in 0..1, smaller near walls and boxes: an approximation of ambient occlusion."""
     above = points + size / 2 * (1, 1, 0)
     openness = np.prod([1 - 0.3 * np.exp(-gap / 0.25) for gap in (above, size - above)], axis=(0, -1))
     for low, high in boxes:
@@ -193,8 +199,8 @@ def _openness(points: np.ndarray, size: np.ndarray, boxes: np.ndarray) -> np.nda
     return openness
 
 
-def _blocked(points: np.ndarray, rays: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-    """Whether the segment from each point along its ray hits a box (slab test)."""
+def _find_blocked(points: np.ndarray, rays: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+    """Whether a box intersects the segment from each point to the end of its ray (slab test)."""
     blocked = np.zeros(rays.shape[:-1], bool)
     inverse = 1 / np.where(np.abs(rays) < 1e-9, 1e-9, rays)
     for low, high in boxes:

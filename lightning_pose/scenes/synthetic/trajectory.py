@@ -1,4 +1,4 @@
-"""Hand-held walks through the synthetic room: smooth splines in one volume, looking at one region."""
+"""Paths of a hand-held camera in the synthetic room: smooth splines in one volume, looking at one region."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ __all__ = ["Walk", "is_test", "make_walks"]
 
 FRAMES_PER_KNOT = 8
 STEP_M = 0.3
-"""How far the camera moves from knot to knot, and the point that it looks at."""
+"""How far the camera's centre, and the point that it looks at, each move from knot to knot."""
 
 ASIDE_M, FAR_M = 0.15, 9.0
-"""How far from the training knots test walks keep, and a distance beyond any in the room: as far as possible."""
+"""Distance of test walks from the training knots, and for training walks a distance larger than any in the room."""
 
 START_M = 1.0
-"""How far from the middle of the volume test walks start at least: the mean training pose should be a bad guess."""
+"""Test walks start at least this far from the middle of the volume, so that the mean training pose is not close."""
 
 WEIGHTS = np.array([1, 1, 0.7, 0.5, 0, 0.3])
-"""How much each coordinate of a knot counts in the distance between knots."""
+"""Weights of a knot's six coordinates in the distance between knots."""
 
 
 @dataclass(frozen=True)
 class Walk:
-    """One sequence's motion as splines over time in frames.
+    """The camera's motion in one sequence, as splines over time in frames.
 
     Attributes:
         position_m: (K, 3) knots of the camera centre.
         target_m: (K, 3) knots of the point it looks at.
         roll_rad: (K, 1) knots of the roll.
-        tremor: (J, 6) knots of the hand's tremor, two frames apart: metres, radians.
+        tremor: (J, 6) knots of the hand's tremor, two frames apart: three in metres, three in radians.
         length: number of frames.
     """
 
@@ -41,15 +41,15 @@ class Walk:
     length: int
 
     def pose(self, frame: float) -> np.ndarray:
-        """(4, 4) camera-to-world at a moment, in frames from the start; x right, y down, z forward."""
+        """Pose (4, 4), camera-to-world, at a time in frames from the start; x right, y down, z forward."""
         knot = frame / FRAMES_PER_KNOT
-        tremor = _spline(self.tremor, frame / 2)
-        position = _spline(self.position_m, knot) + tremor[:3]
-        forward = _spline(self.target_m, knot) - position
+        tremor = _evaluate_spline(self.tremor, frame / 2)
+        position = _evaluate_spline(self.position_m, knot) + tremor[:3]
+        forward = _evaluate_spline(self.target_m, knot) - position
         forward /= np.linalg.norm(forward)
         right = np.cross(forward, (0, 0, 1))
         right /= np.linalg.norm(right)
-        shake = _rotation(tremor[3:] + np.array([0, 0, 1]) * _spline(self.roll_rad, knot))
+        shake = _make_rotation(tremor[3:] + np.array([0, 0, 1]) * _evaluate_spline(self.roll_rad, knot))
         pose = np.eye(4)
         pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1) @ shake
         pose[:3, 3] = position
@@ -57,15 +57,15 @@ class Walk:
 
 
 def is_test(sequence: int) -> bool:
-    """Whether a sequence, counted from 0, is held out: the third of every five."""
+    """Whether a sequence, counted from 0, belongs to the test split: the third of every five does."""
     return sequence % 5 == 2
 
 
 def make_walks(seed: int, size_m: np.ndarray, lengths: list[int]) -> list[Walk]:
-    """One walk per sequence, all in the same volume of about 3 x 2 x 0.6 m, looking at the far wall.
+    """Make one walk per sequence, all in the same volume of about 3 x 2 x 0.6 m, looking at the far wall.
 
-    Training walks explore: of several candidates, each next knot is the one farthest from all earlier knots,
-    in position and in the point looked at. Test walks pass among them, at `ASIDE_M` from the nearest.
+    For training walks, each next knot is, of several candidates, the one farthest from all earlier knots in position
+    and in the point looked at, so that they cover the volume. Test walks stay at `ASIDE_M` from the nearest of these.
     """
     rng = np.random.default_rng([seed, 1])
     near, far = -size_m[1] / 2 + 0.4, size_m[1] / 2
@@ -77,23 +77,24 @@ def make_walks(seed: int, size_m: np.ndarray, lengths: list[int]) -> list[Walk]:
     for held_out in (False, True):
         for i in range(len(lengths)):
             if is_test(i) == held_out:
-                knots[i] = _wander(rng, low, high, counts[i], seen, ASIDE_M if held_out else FAR_M)
+                knots[i] = _choose_knots(rng, low, high, counts[i], seen, ASIDE_M if held_out else FAR_M)
                 seen = seen if held_out else np.concatenate([seen, knots[i]])
-    return [_hand_held(rng, knots[i], length) for i, length in enumerate(lengths)]
+    return [_make_walk(rng, knots[i], length) for i, length in enumerate(lengths)]
 
 
-def _hand_held(rng: np.random.Generator, knots: np.ndarray, length: int) -> Walk:
+def _make_walk(rng: np.random.Generator, knots: np.ndarray, length: int) -> Walk:
+    """Add a roll and a tremor to knots (K, 6) of position and target."""
     roll = np.radians(rng.uniform(-5, 5, (len(knots), 1)))
     tremor = 0.003 * rng.standard_normal((length // 2 + 5, 6))
     return Walk(knots[:, :3], knots[:, 3:], roll, tremor, length)
 
 
-def _wander(
+def _choose_knots(
     rng: np.random.Generator, low: np.ndarray, high: np.ndarray, count: int, seen: np.ndarray, aside_m: float
 ) -> np.ndarray:
-    """(count, 6) knots of position and target within bounds, a step apart, turning gently.
+    """Choose (count, 6) knots of position and target within bounds, a step apart, without sharp turns.
 
-    Each is the candidate whose distance from the nearest knot seen is closest to `aside_m`.
+    Each is, of several candidates, the one whose distance from the nearest knot in `seen` is closest to `aside_m`.
     """
 
     def choose(options: np.ndarray, seen: np.ndarray) -> np.ndarray:
@@ -109,7 +110,7 @@ def _wander(
         turns = heading + 1.3 * rng.standard_normal((24, 6)) * (1, 1, 0.4, 1, 0, 0.5)
         for part in (slice(0, 3), slice(3, 6)):
             turns[:, part] *= STEP_M / np.linalg.norm(turns[:, part], axis=1, keepdims=True)
-        # A step that would leave the volume turns back, axis by axis.
+        # A step that would leave the volume is reversed, axis by axis.
         ahead = knots[-1] + turns
         turns = np.where((ahead < low) | (ahead > high), -turns, turns)
         knots.append(choose(knots[-1] + turns, np.vstack([seen, *knots[:-2]])))
@@ -117,16 +118,16 @@ def _wander(
     return np.array(knots)
 
 
-def _spline(knots: np.ndarray, at: float) -> np.ndarray:
-    """Uniform Catmull-Rom spline; time 0 lies at the third knot, so that blur may look a little back."""
+def _evaluate_spline(knots: np.ndarray, at: float) -> np.ndarray:
+    """Value of a uniform Catmull-Rom spline; time 0 is at the third knot, because motion blur needs times before 0."""
     i = int(np.floor(at)) + 2
     f = at - np.floor(at)
     a, b, c, d = knots[i - 1 : i + 3]
     return b + 0.5 * f * (c - a + f * (2 * a - 5 * b + 4 * c - d + f * (3 * (b - c) + d - a)))
 
 
-def _rotation(vector: np.ndarray) -> np.ndarray:
-    """Rodrigues: the rotation by |vector| radians about it."""
+def _make_rotation(vector: np.ndarray) -> np.ndarray:
+    """Rotation matrix (3, 3) by |vector| radians about a vector (Rodrigues' formula)."""
     angle = float(np.linalg.norm(vector)) + 1e-12
     x, y, z = vector / angle
     K = np.array([(0, -z, y), (z, 0, -x), (-y, x, 0)])

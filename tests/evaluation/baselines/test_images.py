@@ -8,7 +8,7 @@ import torch
 
 from lightning_pose.errors import ConfigError
 from lightning_pose.evaluation.baselines.images import BaselineResult, evaluate_baselines
-from lightning_pose.features.retrieval import global_vectors, nearest
+from lightning_pose.features.retrieval import compute_global_vectors, find_nearest
 from lightning_pose.geometry.quaternions import orientation_error_deg, position_error_m, quat_normalize
 
 NAMES = ["train_mean", "retrieval_top1", "retrieval_top5", "oracle"]
@@ -74,14 +74,14 @@ def test_oracle_keeps_centimetres_in_geographic_coordinates() -> None:
 def test_vlad_finds_the_image_of_the_same_points() -> None:
     train = descriptors(13)
     test = descriptors(13, seed=5)[3:6].flip(1)  # other noise, other order
-    vectors = global_vectors(train, test)
-    assert nearest(vectors[1], vectors[0], k=1).squeeze(1).tolist() == [3, 4, 5]
+    vectors = compute_global_vectors(train, test)
+    assert find_nearest(vectors[1], vectors[0], k=1).squeeze(1).tolist() == [3, 4, 5]
 
 
 def test_vlad_vectors_are_unit_and_ignore_zero_rows() -> None:
     train = descriptors(13)
     padded = torch.cat([train, torch.zeros(13, 20, 8)], dim=1)
-    train_vectors, padded_vectors = global_vectors(train, padded)
+    train_vectors, padded_vectors = compute_global_vectors(train, padded)
     torch.testing.assert_close(train_vectors, padded_vectors)
     torch.testing.assert_close(train_vectors.norm(dim=1), torch.ones(13))
     assert train_vectors.shape == (13, 64 * 8)
@@ -89,8 +89,8 @@ def test_vlad_vectors_are_unit_and_ignore_zero_rows() -> None:
 
 def test_maps_are_pooled_and_numpy_is_welcome() -> None:
     maps = np.random.default_rng(0).random((6, 5, 2, 3), dtype=np.float32)
-    from_maps, _ = global_vectors(maps, maps)
-    from_vectors, _ = global_vectors(maps.mean((2, 3)), maps.mean((2, 3)))
+    from_maps, _ = compute_global_vectors(maps, maps)
+    from_vectors, _ = compute_global_vectors(maps.mean((2, 3)), maps.mean((2, 3)))
     torch.testing.assert_close(from_maps, from_vectors)
 
 
@@ -136,6 +136,6 @@ def test_no_frames_are_refused(n_train: int, n_test: int) -> None:
 
 def test_layouts_that_differ_are_refused() -> None:
     with pytest.raises(ConfigError, match=r"\(3, 4\) in train and \(3, 5\) in test; give both"):
-        global_vectors(torch.randn(3, 4), torch.randn(3, 5))
+        compute_global_vectors(torch.randn(3, 4), torch.randn(3, 5))
     with pytest.raises(ConfigError, match=r"give both as \(N, D\)"):
-        global_vectors(torch.randn(3), torch.randn(3))
+        compute_global_vectors(torch.randn(3), torch.randn(3))

@@ -13,7 +13,13 @@ from scipy.spatial.transform import Rotation
 
 from lightning_pose.errors import ConfigError, ImageError
 from lightning_pose.evaluation.baselines import visual_odometry as module
-from lightning_pose.evaluation.baselines.visual_odometry import View, clip_poses, match_motion, visual_odometry
+from lightning_pose.evaluation.baselines.visual_odometry import (
+    View,
+    assume_intrinsics,
+    match_motion,
+    read_clip_poses,
+    run_visual_odometry,
+)
 from lightning_pose.geometry.quaternions import orientation_error_deg, position_error_m, quat_rotate
 from lightning_pose.geometry.relative import RelativeFrame, relative_poses
 from lightning_pose.scenes.formats import load_scene
@@ -104,8 +110,8 @@ def _scattered(view: View, n: int) -> View:
 def test_a_room_is_followed(room: Scene, relative_frame: RelativeFrame) -> None:
     """Six frames, 20 cm from end to end."""
     clips = np.arange(18).reshape(3, 6)
-    motion = visual_odometry(room.frames, clips, relative_frame, progress=False)
-    position_m, quat_wxyz = relative_poses(*clip_poses(room.frames, clips), relative_frame)
+    motion = run_visual_odometry(room.frames, clips, relative_frame, progress=False)
+    position_m, quat_wxyz = relative_poses(*read_clip_poses(room.frames, clips), relative_frame)
     assert (motion.steps, motion.failed_steps) == (15, 0)
     assert motion.position_m.shape == (3, 6, 3)
     assert motion.quat_wxyz.dtype == torch.float64
@@ -116,7 +122,7 @@ def test_a_room_is_followed(room: Scene, relative_frame: RelativeFrame) -> None:
 
 def test_world_axes_are_the_cameras_turned_by_the_true_orientation(room: Scene) -> None:
     clips = np.array([[0, 1, 2]])
-    camera, world = (visual_odometry(room.frames, clips, axes, progress=False) for axes in ("camera", "world"))
+    camera, world = (run_visual_odometry(room.frames, clips, axes, progress=False) for axes in ("camera", "world"))
     turn = torch.from_numpy(room.frames[0].quat_wxyz)
     torch.testing.assert_close(world.position_m, quat_rotate(turn, camera.position_m))
     torch.testing.assert_close(world.quat_wxyz, camera.quat_wxyz)
@@ -125,10 +131,10 @@ def test_world_axes_are_the_cameras_turned_by_the_true_orientation(room: Scene) 
 
 def test_steps_have_the_true_length_and_do_not_depend_on_the_threads(room: Scene) -> None:
     clips = torch.tensor([[0, 1], [1, 3], [4, 2]])
-    motion = visual_odometry(room.frames, clips, progress=False, workers=1)
+    motion = run_visual_odometry(room.frames, clips, progress=False, workers=1)
     lengths = [np.linalg.norm(room.frames[b].position_m - room.frames[a].position_m) for a, b in clips.tolist()]
     assert motion.position_m[:, 1].norm(dim=-1).tolist() == pytest.approx(lengths)
-    again = visual_odometry(room.frames, clips, progress=False, workers=3)
+    again = run_visual_odometry(room.frames, clips, progress=False, workers=3)
     assert torch.equal(again.position_m, motion.position_m)
     assert torch.equal(again.quat_wxyz, motion.quat_wxyz)
 
@@ -146,17 +152,17 @@ def test_overlapping_clips_share_images_and_steps(room: Scene, monkeypatch: pyte
             matched.append((a.index, b.index))
 
     monkeypatch.setattr(module, "CHUNK", 1)
-    monkeypatch.setattr(module, "_view", view)
+    monkeypatch.setattr(module, "describe_frame", view)
     monkeypatch.setattr(module, "match_motion", motion)
     clips = np.lib.stride_tricks.sliding_window_view(np.arange(6), 4)
-    found = visual_odometry(room.frames, clips, progress=False, workers=2)
+    found = run_visual_odometry(room.frames, clips, progress=False, workers=2)
     assert sorted(described) == list(range(6))
     assert sorted(matched) == [(i, i + 1) for i in range(5)]
     assert (found.steps, found.failed_steps) == (5, 5)
 
 
 def test_steps_through_blank_images_stand_still_and_are_counted(blank: list[Frame]) -> None:
-    motion = visual_odometry(blank, np.array([[0, 1, 2], [1, 2, 3]]), progress=False)
+    motion = run_visual_odometry(blank, np.array([[0, 1, 2], [1, 2, 3]]), progress=False)
     assert (motion.steps, motion.failed_steps) == (3, 3)
     assert not motion.position_m.any()
     torch.testing.assert_close(motion.quat_wxyz, torch.eye(4)[0].double().expand(2, 3, 4))
@@ -164,29 +170,29 @@ def test_steps_through_blank_images_stand_still_and_are_counted(blank: list[Fram
 
 def test_a_failed_step_keeps_the_others(room: Scene, blank: list[Frame]) -> None:
     frames = [*room.frames[:3], blank[0]]
-    motion = visual_odometry(frames, np.array([[0, 1, 3, 3]]), progress=False)
+    motion = run_visual_odometry(frames, np.array([[0, 1, 3, 3]]), progress=False)
     assert (motion.steps, motion.failed_steps) == (3, 1)  # a frame repeated has not moved: no failure
-    first = visual_odometry(frames, np.array([[0, 1]]), progress=False)
+    first = run_visual_odometry(frames, np.array([[0, 1]]), progress=False)
     torch.testing.assert_close(motion.position_m[0, 1:], first.position_m[0, 1:].expand(3, 3))
 
 
 def test_clips_of_one_frame_and_no_clips_have_no_steps(blank: list[Frame]) -> None:
     for shape in ((2, 1), (0, 5)):
-        motion = visual_odometry(blank, np.zeros(shape, int))
+        motion = run_visual_odometry(blank, np.zeros(shape, int))
         assert motion.position_m.shape == (*shape, 3)
         assert motion.quat_wxyz.shape == (*shape, 4)
         assert motion.steps == 0
 
 
 def test_an_unknown_camera_is_taken_for_a_kinects() -> None:
-    assert module._assumed(640, 480) == Intrinsics(525, 525, 320, 240)
-    assert module._assumed(480, 640) == Intrinsics(525, 525, 240, 320)
+    assert assume_intrinsics(640, 480) == Intrinsics(525, 525, 320, 240)
+    assert assume_intrinsics(480, 640) == Intrinsics(525, 525, 240, 320)
 
 
 def test_the_bar_is_on_stderr_and_only_if_wanted(blank: list[Frame], capfd: pytest.CaptureFixture[str]) -> None:
-    visual_odometry(blank, np.array([[0, 1]]), progress=False)
+    run_visual_odometry(blank, np.array([[0, 1]]), progress=False)
     assert capfd.readouterr() == ("", "")
-    visual_odometry(blank, np.array([[0, 1]]))
+    run_visual_odometry(blank, np.array([[0, 1]]))
     out, err = capfd.readouterr()
     assert not out
     assert "visual odometry" in err
@@ -196,15 +202,15 @@ def test_the_bar_is_on_stderr_and_only_if_wanted(blank: list[Frame], capfd: pyte
 def test_a_missing_image_is_named(blank: list[Frame], tmp_path: Path) -> None:
     gone = Frame(tmp_path / "gone.png", np.zeros(3), np.array([1.0, 0, 0, 0]), "one", 4)
     with pytest.raises(ImageError, match=r"gone.png does not exist"):
-        visual_odometry([*blank, gone], np.array([[3, 4]]), progress=False)
+        run_visual_odometry([*blank, gone], np.array([[3, 4]]), progress=False)
 
 
 def test_clips_that_are_no_indices_are_refused(blank: list[Frame]) -> None:
     with pytest.raises(ConfigError, match=r"clips are int64 of shape \(3,\); give \(B, T\) whole numbers"):
-        visual_odometry(blank, np.arange(3))
+        run_visual_odometry(blank, np.arange(3))
     with pytest.raises(ConfigError, match=r"clips are float64 of shape \(1, 2\)"):
-        visual_odometry(blank, np.zeros((1, 2)))
+        run_visual_odometry(blank, np.zeros((1, 2)))
     with pytest.raises(ConfigError, match="clips name frames -1 to 4; there are 4, numbered from 0"):
-        visual_odometry(blank, np.array([[-1, 4]]))
+        run_visual_odometry(blank, np.array([[-1, 4]]))
     with pytest.raises(ConfigError, match="relative_frame is 'body'"):
-        visual_odometry(blank, np.array([[0, 1]]), "body")  # type: ignore[arg-type]
+        run_visual_odometry(blank, np.array([[0, 1]]), "body")  # type: ignore[arg-type]

@@ -16,9 +16,16 @@ from torch import Tensor
 
 from lightning_pose.errors import ConfigError, ImageError
 from lightning_pose.features.surf import SURF
-from lightning_pose.features.surf.descriptor import describe, orientations
-from lightning_pose.features.surf.detector import detect
-from lightning_pose.features.surf.hessian import LAYERS, OCTAVES, determinants, determinants_at, integral_image, margin
+from lightning_pose.features.surf.descriptor import compute_descriptors, compute_orientations
+from lightning_pose.features.surf.detector import detect_keypoints
+from lightning_pose.features.surf.hessian import (
+    LAYERS,
+    OCTAVES,
+    compute_determinants,
+    compute_determinants_at,
+    compute_integral_image,
+    compute_margin,
+)
 
 REFERENCE = np.load(Path(__file__).parent / "data" / "surf_opencv.npz")
 TEXTURED = ("blobs", "shapes", "fractal")
@@ -123,18 +130,21 @@ def test_batch_equals_single() -> None:
 @pytest.mark.parametrize("n", [80, 700])
 def test_stages_work_on_batches(n: int) -> None:
     images = torch.cat([texture(120, 160), torch.zeros((1, 120, 160), dtype=torch.uint8), texture(120, 160, seed=1)])
-    integral = integral_image(images)
-    together = detect(integral, n, 0.0)
+    integral = compute_integral_image(images)
+    together = detect_keypoints(integral, n, 0.0)
     index = torch.arange(3).repeat_interleave(n)
     place = together.xy.flatten(0, 1), together.size.flatten()
-    angles = orientations(integral, index, *place).view(3, n)
-    descriptors = describe(integral, index, *place, angles.flatten()).view(3, n, 64)
+    angles = compute_orientations(integral, index, *place).view(3, n)
+    descriptors = compute_descriptors(integral, index, *place, angles.flatten()).view(3, n, 64)
     for i in range(3):
-        alone = detect(integral[i : i + 1], n, 0.0)
+        alone = detect_keypoints(integral[i : i + 1], n, 0.0)
         assert all(torch.equal(a[0], b[i]) for a, b in zip(alone, together, strict=True))
-        one = describe(integral[i : i + 1], index[:n], alone.xy[0], alone.size[0], angles[i])
+        one = compute_descriptors(integral[i : i + 1], index[:n], alone.xy[0], alone.size[0], angles[i])
         np.testing.assert_allclose(
-            orientations(integral[i : i + 1], index[:n], alone.xy[0], alone.size[0]), angles[i], atol=1e-2, rtol=0
+            compute_orientations(integral[i : i + 1], index[:n], alone.xy[0], alone.size[0]),
+            angles[i],
+            atol=1e-2,
+            rtol=0,
         )
         np.testing.assert_allclose(one, descriptors[i], atol=1e-6, rtol=0)
 
@@ -187,7 +197,7 @@ def test_oriented_descriptors_turn_with_the_image() -> None:
 
 
 def test_integral_images_are_exact_beyond_int32() -> None:
-    integral = integral_image(torch.full((1, 3000, 3000), 255, dtype=torch.uint8))[0]
+    integral = compute_integral_image(torch.full((1, 3000, 3000), 255, dtype=torch.uint8))[0]
     assert integral[0].eq(0).all()
     assert integral[:, 0].eq(0).all()
     assert integral[-1, -1] < 0  # wrapped around
@@ -198,16 +208,16 @@ def test_integral_images_are_exact_beyond_int32() -> None:
 @pytest.mark.parametrize("octave", range(OCTAVES))
 @pytest.mark.parametrize("layer", range(LAYERS))
 def test_determinants_of_a_grid_and_of_single_samples_agree(octave: int, layer: int) -> None:
-    integral = integral_image(texture(300, 340))
-    first = margin(layer)
+    integral = compute_integral_image(texture(300, 340))
+    first = compute_margin(layer)
     n, m = (300 >> octave) - 2 * first, (340 >> octave) - 2 * first
     grid = torch.empty(1, n, m)
-    determinants(integral, octave, layer, first, torch.empty(4, integral.numel()), grid)
+    compute_determinants(integral, octave, layer, first, torch.empty(4, integral.numel()), grid)
     row, col = (
         t.flatten() for t in torch.meshgrid(torch.arange(1, n - 1, 5), torch.arange(1, m - 1, 3), indexing="ij")
     )
     every = torch.full_like(row, octave), torch.full_like(row, layer), torch.zeros_like(row)
-    single = determinants_at(integral, *every, row + first, col + first)
+    single = compute_determinants_at(integral, *every, row + first, col + first)
     around = torch.stack([grid[0, row + i, col + j] for i in (-1, 0, 1) for j in (-1, 0, 1)]).view_as(single)
     np.testing.assert_allclose(single, around, rtol=1e-4, atol=grid.abs().max().item() * 1e-6)
 
@@ -245,7 +255,7 @@ def test_records() -> None:
 
 
 @pytest.mark.parametrize(
-    ("images", "says"),
+    ("images", "message"),
     [
         (torch.zeros((40, 50), dtype=torch.uint8), r"\(40, 50\).*image\[None\]"),
         (torch.zeros((1, 3, 40, 50), dtype=torch.uint8), r"\(1, 3, 40, 50\).*\(B, H, W\)"),
@@ -256,8 +266,8 @@ def test_records() -> None:
         (torch.full((1, 40, 50), torch.nan), r"nan.*0..1"),
     ],
 )
-def test_wrong_images(images: Tensor, says: str) -> None:
-    with pytest.raises(ImageError, match=says):
+def test_wrong_images(images: Tensor, message: str) -> None:
+    with pytest.raises(ImageError, match=message):
         SURF(20)(images)
 
 
@@ -270,13 +280,13 @@ def test_wrong_arrays(wrong: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "says"),
+    ("settings", "message"),
     [
         ({"n_features": 0}, "n_features is 0"),
         ({"threshold": -1.0}, "threshold is -1.0; give 0"),
         ({"threshold": float("nan")}, "nan"),
     ],
 )
-def test_wrong_settings(settings: dict, says: str) -> None:
-    with pytest.raises(ConfigError, match=says):
+def test_wrong_settings(settings: dict, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         SURF(**settings)

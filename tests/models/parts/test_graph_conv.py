@@ -21,11 +21,11 @@ def test_gcn_is_the_mean_of_a_node_and_its_neighbours(aggr: str | None) -> None:
     torch.testing.assert_close(convolution(TARGET, SOURCE, EDGES), expected)
 
 
-@pytest.mark.parametrize(("aggr", "heard"), [(None, [12.0, 6.0]), ("mean", [4.0, 2.0]), ("max", [8.0, 4.0])])
-def test_wl_hears_its_neighbours_beside_itself(aggr: str | None, heard: list[float]) -> None:
+@pytest.mark.parametrize(("aggr", "received"), [(None, [12.0, 6.0]), ("mean", [4.0, 2.0]), ("max", [8.0, 4.0])])
+def test_wl_adds_its_neighbours_to_itself(aggr: str | None, received: list[float]) -> None:
     convolution = GraphConvolution("wl", 2, 2, aggr)
     for linear, weight in ((convolution.layer.lin_rel, 1.0), (convolution.layer.lin_root, 10.0)):  # type: ignore[union-attr]
         linear.weight.data = weight * torch.eye(2)  # type: ignore[union-attr]
         if linear.bias is not None:  # type: ignore[union-attr]
             linear.bias.data.zero_()  # type: ignore[union-attr]
-    torch.testing.assert_close(convolution(TARGET, SOURCE, EDGES), 10 * TARGET + torch.tensor([heard]))
+    torch.testing.assert_close(convolution(TARGET, SOURCE, EDGES), 10 * TARGET + torch.tensor([received]))

@@ -5,14 +5,13 @@ from __future__ import annotations
 import pytest
 import torch
 
-from lightning_pose.models.parts import neighbour_graph
 from lightning_pose.models.parts.neighbour_graph import (
     ABSENT,
-    edge_index,
-    neighbourhood,
-    neighbours_within,
+    find_neighbourhood,
+    list_edges,
     sample_neighbours,
     search_neighbours,
+    search_within_graph,
 )
 
 LINE = torch.tensor([[0.0], [1.0], [3.0], [7.0], [15.0]])
@@ -47,21 +46,20 @@ def test_chunks_find_the_same_neighbours(monkeypatch: pytest.MonkeyPatch) -> Non
     whole = search_neighbours(points, points, 4, frame, frame, gap=3)
     rows = []
     measured = torch.cdist
-    monkeypatch.setattr(neighbour_graph, "_CHUNK_ELEMENTS", 350)
     monkeypatch.setattr(torch, "cdist", lambda a, b: rows.append(len(a)) or measured(a, b))
-    assert torch.equal(search_neighbours(points, points, 4, frame, frame, gap=3), whole)
+    assert torch.equal(search_neighbours(points, points, 4, frame, frame, gap=3, chunk_elements=350), whole)
     assert max(rows) == 7
     assert sum(rows) == 50
 
 
 def test_nodes_of_one_image_are_joined_to_each_other_alone() -> None:
-    table = neighbours_within(torch.stack([LINE[:3], LINE[2:]]), 1)
+    table = search_within_graph(torch.stack([LINE[:3], LINE[2:]]), 1)
     assert table.tolist() == [[1], [0], [1], [4], [3], [4]]
-    assert neighbours_within(LINE[None], 9).shape == (5, 4)
+    assert search_within_graph(LINE[None], 9).shape == (5, 4)
 
 
-def test_edges_lead_from_neighbours_to_the_node_that_hears_them() -> None:
-    assert edge_index(torch.tensor([[1, 2], [0, ABSENT]])).tolist() == [[1, 2, 0], [0, 0, 1]]
+def test_edges_lead_from_neighbours_to_their_node() -> None:
+    assert list_edges(torch.tensor([[1, 2], [0, ABSENT]])).tolist() == [[1, 2, 0], [0, 0, 1]]
 
 
 def test_a_sample_holds_different_neighbours_of_the_node() -> None:
@@ -76,8 +74,8 @@ def test_a_sample_holds_different_neighbours_of_the_node() -> None:
 
 
 def test_a_neighbourhood_is_what_its_seeds_depend_on() -> None:
-    chain = torch.tensor([[1], [2], [3], [4], [ABSENT], [0]])  # 0 hears 1, which hears 2, ...; 5 hears 0
-    nodes, table, seeds = neighbourhood(chain, torch.tensor([1, 0]), hops=2)
+    chain = torch.tensor([[1], [2], [3], [4], [ABSENT], [0]])  # from 1 to 0, from 2 to 1, ...; from 0 to 5
+    nodes, table, seeds = find_neighbourhood(chain, torch.tensor([1, 0]), hops=2)
     assert nodes.tolist() == [0, 1, 2, 3]
     assert table.tolist() == [[1], [2], [3], [ABSENT]]
     assert seeds.tolist() == [1, 0]

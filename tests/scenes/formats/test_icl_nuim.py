@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from lightning_pose.errors import DataError
 from lightning_pose.scenes.formats import load_scene
-from lightning_pose.scenes.formats.icl_nuim import reflect
+from lightning_pose.scenes.formats.icl_nuim import reflect_poses
 from lightning_pose.scenes.scene import Intrinsics
 from tests.data.helpers import make_image
 
@@ -33,7 +33,7 @@ def test_reflection_is_s_t_s() -> None:
     S = np.diag([1.0, -1, 1, 1])
     expected = S @ T @ S
     quats = Rotation.from_matrix(T[:, :3, :3]).as_quat(scalar_first=True)
-    positions, reflected = reflect(T[:, :3, 3], quats)
+    positions, reflected = reflect_poses(T[:, :3, 3], quats)
     np.testing.assert_allclose(positions, expected[:, :3, 3])
     np.testing.assert_allclose(
         Rotation.from_quat(reflected, scalar_first=True).as_matrix(), expected[:, :3, :3], atol=1e-12
@@ -59,7 +59,7 @@ def test_image_list_is_used_where_there_is_one(tmp_path: Path) -> None:
     assert [f.index for f in load_scene(tmp_path, val_fraction=0).frames] == [1, 2]
 
 
-def test_numbered_groundtruth_is_recognised_and_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_numbered_groundtruth_is_recognised_with_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     write(tmp_path, "groundtruth.txt")
     (tmp_path / "rgb.txt").write_text("1 rgb/1.png\n2 rgb/2.png\n3 rgb/3.png\n")
     with caplog.at_level(logging.WARNING, "lightning_pose"):

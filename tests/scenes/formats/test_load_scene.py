@@ -30,7 +30,7 @@ def test_formats() -> None:
     assert {"7scenes", "cambridge", "icl_nuim", "tum"} <= known_formats().keys()
 
 
-def test_a_format_costs_one_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_format_is_one_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "added_format.py").write_text(ONE_FILE)
     (tmp_path / "added.txt").touch()
     monkeypatch.setattr(formats, "__path__", [*formats.__path__, str(tmp_path)])
@@ -48,7 +48,7 @@ def test_missing_folder(tmp_path: Path) -> None:
         load_scene(tmp_path / "nowhere")
 
 
-def test_no_dataset_says_what_was_looked_for(tmp_path: Path) -> None:
+def test_no_dataset_lists_the_files_that_were_looked_for(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"7scenes: TrainSplit.txt and TestSplit.txt; .* force a format") as caught:
         load_scene(str(tmp_path))
     assert str(tmp_path) in str(caught.value)
@@ -62,10 +62,10 @@ def test_parent_folder_names_the_datasets_inside(tmp_path: Path) -> None:
         load_scene(tmp_path)
 
 
-def test_two_formats_in_one_folder_must_be_told_apart(tmp_path: Path) -> None:
+def test_of_two_formats_in_one_folder_one_must_be_given(tmp_path: Path) -> None:
     write_seven_scenes(tmp_path, train={1: 4}, test={2: 1})
     for name in ("dataset_train.txt", "dataset_test.txt"):
         (tmp_path / name).touch()
-    with pytest.raises(DataError, match=r"may be cambridge or 7scenes; say which with `format`"):
+    with pytest.raises(DataError, match=r"may be cambridge or 7scenes; give one of them as `format`"):
         load_scene(tmp_path)
     assert load_scene(tmp_path, format="7scenes").format == "7scenes"

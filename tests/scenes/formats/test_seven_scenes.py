@@ -70,7 +70,7 @@ def test_synthetic_room_gives_its_camera(root: Path) -> None:
 
 def test_synthetic_room_without_a_camera_is_refused(root: Path) -> None:
     (root / "synthetic.json").write_text("{}")
-    with pytest.raises(DataError, match=r"synthetic\.json: no `intrinsics`.*render it anew"):
+    with pytest.raises(DataError, match=r"synthetic\.json: no `intrinsics`.*render the room again"):
         load_scene(root)
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from lightning_pose.errors import DataError, ImageError
 from lightning_pose.scenes.formats import load_scene
-from lightning_pose.scenes.formats.tum import associate
+from lightning_pose.scenes.formats.tum import pair_by_time
 from lightning_pose.scenes.scene import Intrinsics
 from tests.data.helpers import REAL_DATA, make_image
 
@@ -42,18 +42,18 @@ def test_pose_and_order_of_the_quaternion(tmp_path: Path) -> None:
 
 def test_association_is_one_to_one_closest_first() -> None:
     """Image 0 and 1 both want pose 0; image 1 is closer, and image 0 then finds nothing within 20 ms."""
-    pairs = associate(np.array([0.0, 0.015, 1.0, 2.0]), np.array([0.014, 0.990, 1.005, 2.021]))
+    pairs = pair_by_time(np.array([0.0, 0.015, 1.0, 2.0]), np.array([0.014, 0.990, 1.005, 2.021]))
     np.testing.assert_array_equal(pairs, [[1, 0], [2, 2]])
 
 
 def test_second_choice_is_taken_when_the_first_is_gone() -> None:
-    pairs = associate(np.array([0.000, 0.010]), np.array([0.008, -0.015]))
+    pairs = pair_by_time(np.array([0.000, 0.010]), np.array([0.008, -0.015]))
     np.testing.assert_array_equal(pairs, [[0, 1], [1, 0]])
 
 
 @pytest.mark.parametrize(("offset", "count"), [(0.0199, 1), (-0.0199, 1), (0.0201, 0), (-0.0201, 0)])
 def test_association_reaches_20_ms(offset: float, count: int) -> None:
-    assert len(associate(np.array([5.0]), np.array([5.0 + offset]))) == count
+    assert len(pair_by_time(np.array([5.0]), np.array([5.0 + offset]))) == count
 
 
 def test_images_without_a_pose_are_dropped_with_a_count(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

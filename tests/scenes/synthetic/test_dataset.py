@@ -13,7 +13,7 @@ import pytest
 
 from lightning_pose.errors import ConfigError, DataError
 from lightning_pose.scenes.synthetic import dataset, render_room
-from lightning_pose.scenes.synthetic.dataset import sequence_lengths
+from lightning_pose.scenes.synthetic.dataset import divide_frames
 from lightning_pose.scenes.synthetic.trajectory import is_test, make_walks
 
 FRAMES, SIZE = 13, (64, 48)
@@ -43,9 +43,9 @@ def test_layout_is_that_of_7_scenes(room: Path) -> None:
     assert image is not None
     assert image.shape == (48, 64, 3)
     assert image.std() > 20
-    told = json.loads((room / "synthetic.json").read_text())
-    assert (told["seed"], told["frames"], told["size"]) == (0, FRAMES, [64, 48])
-    assert told["intrinsics"] == {"fx": 52.5, "fy": 52.5, "cx": 31.5, "cy": 23.5}
+    written = json.loads((room / "synthetic.json").read_text())
+    assert (written["seed"], written["frames"], written["size"]) == (0, FRAMES, [64, 48])
+    assert written["intrinsics"] == {"fx": 52.5, "fy": 52.5, "cx": 31.5, "cy": 23.5}
 
 
 def test_poses_are_rigid_and_inside_the_room(room: Path) -> None:
@@ -135,13 +135,13 @@ def test_bad_values_are_named_with_their_remedy(tmp_path: Path, wrong: dict, mes
     ("frames", "count", "longest"), [(6, 3, 2), (150, 5, 30), (300, 10, 30), (1000, 10, 100), (2350, 24, 98)]
 )
 def test_sequences_are_few_and_at_most_100_frames(frames: int, count: int, longest: int) -> None:
-    lengths = sequence_lengths(frames)
+    lengths = divide_frames(frames)
     assert (sum(lengths), len(lengths), max(lengths)) == (frames, count, longest)
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_test_walks_pass_near_training_walks_and_steps_are_small(seed: int) -> None:
-    lengths = sequence_lengths(300)
+    lengths = divide_frames(300)
     walks = make_walks(seed, np.array([6.0, 4.1, 2.7]), lengths)
     poses = [np.array([walk.pose(frame) for frame in range(walk.length)]) for walk in walks]
     train = np.concatenate([p for i, p in enumerate(poses) if not is_test(i)])[:, :3, 3]

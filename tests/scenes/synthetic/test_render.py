@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-from lightning_pose.scenes.synthetic.render import Renderer, pinhole
+from lightning_pose.scenes.synthetic.render import Renderer, make_camera
 from lightning_pose.scenes.synthetic.room import Quad, make_room
 
 SIZE = (320, 240)
-CAMERA = pinhole(SIZE)
+CAMERA = make_camera(SIZE)
 AHEAD = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 1], [0, 0, 0, 1]], float)
 """One metre above the origin, looking along y."""
 
@@ -90,7 +90,7 @@ def test_squares_far_smaller_than_a_pixel_become_gray() -> None:
     squares = board((254, 254), 4)
     quad = Quad(np.array([-20.0, 20, 21]), np.array([40.0, 0, 0]), np.array([0, 0, -40.0]), squares)
     small = (64, 48)
-    image = Renderer([quad], pinhole(small), small).render(AHEAD)
+    image = Renderer([quad], make_camera(small), small).render(AHEAD)
     assert image[10:-10, 10:-10].std() < 6
     assert image[10:-10, 10:-10].mean() == pytest.approx(127, abs=5)
 

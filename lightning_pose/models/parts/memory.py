@@ -1,0 +1,46 @@
+"""TrainingMemory: for architectures whose checkpoint carries something of every training frame."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+from lightning import LightningModule
+from torch import Tensor, nn
+
+__all__ = ["TrainingMemory"]
+
+
+class TrainingMemory(LightningModule):
+    """Mixin for tensors whose length depends on the training split, such as the features of each training frame.
+
+    Name it before `PoseModule` among the base classes. In a new module the tensors have length 0; whenever weights
+    are loaded, they get the checkpoint's length. Other differences in shape are left
+    for the loading to refuse.
+
+    Attributes:
+        memory: names of these parameters and buffers, as the state dict has them.
+    """
+
+    memory: ClassVar[tuple[str, ...]]
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.register_load_state_dict_pre_hook(_resize_before_load)
+
+    def resize_memory(self, state_dict: dict[str, Tensor]) -> None:
+        """Give each tensor of the memory the length that it has in a state dict; its values become zeros."""
+        parameters = dict(self.named_parameters())
+        for name in self.memory:
+            if name in state_dict:
+                tensor = parameters[name] if name in parameters else self.get_buffer(name)
+                tensor.data = tensor.new_zeros(len(state_dict[name]), *tensor.shape[1:])
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        self.resize_memory(checkpoint["state_dict"])
+        super().on_load_checkpoint(checkpoint)
+
+
+def _resize_before_load(module: nn.Module, state_dict: dict[str, Tensor], prefix: str, *_: object) -> None:
+    """`load_state_dict` of the module, or of one that holds it, calls this before it copies anything."""
+    assert isinstance(module, TrainingMemory)
+    module.resize_memory({name.removeprefix(prefix): value for name, value in state_dict.items()})

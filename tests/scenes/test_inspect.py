@@ -1,0 +1,147 @@
+"""What `inspect` finds in scenes of five frames, against values computed by hand."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from lightning_pose.scenes.inspect import (
+    count_sequence_frames,
+    describe_scene,
+    inspect_images,
+    inspect_poses,
+    read_image_files,
+)
+from lightning_pose.scenes.scene import Frame, Intrinsics, Scene
+
+
+def turn_z(degrees: float) -> np.ndarray:
+    """The quaternion wxyz of a rotation about z."""
+    half = math.radians(degrees) / 2
+    return np.array([math.cos(half), 0, 0, math.sin(half)])
+
+
+def make_scene(
+    root: Path, x_m: Sequence[float] = (0, 1, 2, 3, 4), angles_deg: Sequence[float] = (0, 10, 20, 30, 40)
+) -> Scene:
+    """Five frames along x, each turned about z: three of sequence `a` (two train, one validates), two of `b` (test)."""
+    frames = [
+        Frame(root / f"{i}.png", np.array([x, 0.0, 1.0]), turn_z(angle), "aaabb"[i], (0, 1, 2, 7, 9)[i])
+        for i, (x, angle) in enumerate(zip(x_m, angles_deg, strict=True))
+    ]
+    splits = {"train": np.array([0, 1]), "val": np.array([2]), "test": np.array([3, 4])}
+    return Scene("line", root, "tum", tuple(frames), splits, split_source="blocks")
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Scene:
+    """`make_scene` with five different images of 8 x 6 pixels."""
+    scene = make_scene(tmp_path)
+    for i, frame in enumerate(scene.frames):
+        cv2.imwrite(str(frame.image), np.full((6, 8, 3), 40 * i, np.uint8))
+    return scene
+
+
+def test_facts_by_hand(scene: Scene) -> None:
+    assert describe_scene(scene, list(read_image_files(scene))) == {
+        "format": "tum, ground truth original",
+        "split (blocks)": "train 2, val 1, test 2",
+        "image size": "8x6",
+        "intrinsics": "unknown",
+        "extent": "4.00 x 0.00 x 0.00 m",
+        # Steps of 1 m and 10 deg in `a`, and of half as much a frame in `b`, whose two frames are numbered 7 and 9.
+        "frame spacing": "median 1 m, 10 deg",
+        "rotation": "up to 20 deg from the mean, median 10 deg",
+        "test to nearest training pose": "median 2.5 m, 25 deg; up to 3 m",
+    }
+
+
+def test_the_camera_and_the_unit_are_named(scene: Scene) -> None:
+    frames = [replace(frame, intrinsics=Intrinsics(525.0, 525.5, 320.0, 240.0)) for frame in scene.frames]
+    facts = describe_scene(replace(scene, frames=tuple(frames), unit="scene"), list(read_image_files(scene)))
+    assert facts["intrinsics"] == "f 525 525.5, c 320 240"
+    assert facts["extent"] == "4.00 x 0.00 x 0.00 scene"
+
+
+def test_a_scene_without_steps_or_test_frames_has_fewer_facts(scene: Scene) -> None:
+    one = replace(scene, frames=scene.frames[:1], splits={"train": np.array([0]), "val": [], "test": []})
+    facts = describe_scene(one, list(read_image_files(one)))
+    assert not {"frame spacing", "test to nearest training pose"} & facts.keys()
+    assert inspect_poses(one).errors == []
+
+
+def test_frames_of_each_sequence_in_each_split(scene: Scene) -> None:
+    a, b = count_sequence_frames(scene)
+    assert a == ("a", {"train": 2, "val": 1, "test": 0}, 0, 2)
+    assert b == ("b", {"train": 0, "val": 0, "test": 2}, 7, 9)
+
+
+def test_sound_images_and_poses_give_no_findings(scene: Scene) -> None:
+    for findings in (inspect_images(scene, list(read_image_files(scene))), inspect_poses(scene)):
+        assert (findings.errors, findings.warnings) == ([], [])
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda path: path.unlink(), "does not exist"),
+        (lambda path: path.write_bytes(b""), "is empty"),
+        (lambda path: path.write_bytes(path.read_bytes()[:40]), "is truncated"),
+    ],
+    ids=["missing", "empty", "truncated"],
+)
+def test_bad_images_are_errors(spoil: Callable[[Path], None], message: str, scene: Scene) -> None:
+    spoil(scene.frames[3].image)
+    files = list(read_image_files(scene))
+    assert [bool(file.error) for file in files] == [False, False, False, True, False]
+    (error,) = inspect_images(scene, files).errors
+    assert error.startswith(f"{scene.frames[3].image} {message}")
+    assert describe_scene(scene, files)["image size"] == "8x6"
+
+
+def test_without_a_readable_image_there_is_no_size(scene: Scene) -> None:
+    for frame in scene.frames:
+        frame.image.write_bytes(b"text")
+    files = list(read_image_files(scene))
+    assert describe_scene(scene, files)["image size"] == "none can be read"
+    assert len(inspect_images(scene, files).errors) == 5
+
+
+def test_copies_are_warned_of_and_those_across_the_split_once_more(scene: Scene) -> None:
+    first, second, third, fourth, _ = (frame.image for frame in scene.frames)
+    second.write_bytes(first.read_bytes())
+    third.write_bytes(fourth.read_bytes())
+    copies, leaks = inspect_images(scene, list(read_image_files(scene))).warnings
+    assert copies.startswith("2 images are copies of others")
+    assert copies.endswith(f"{second} is {first}")
+    assert leaks.startswith("1 test images are also training or validation images")
+    assert leaks.endswith(f"{fourth} is {third}")
+
+
+def test_sizes_that_differ_are_counted(scene: Scene) -> None:
+    cv2.imwrite(str(scene.frames[4].image), np.zeros((3, 4, 3), np.uint8))
+    (warning,) = inspect_images(scene, list(read_image_files(scene))).warnings
+    assert warning.startswith("images of 2 sizes, 8x6 (4), 4x3 (1); resize them")
+
+
+def test_a_step_of_twenty_medians_is_a_jump(tmp_path: Path) -> None:
+    (warning,) = inspect_poses(make_scene(tmp_path, x_m=(0, 1, 2, 3, 99))).warnings
+    assert warning == f"{tmp_path / '3.png'} to 4.png: the pose jumps by 48 m and 5 deg; check both poses"
+    assert inspect_poses(make_scene(tmp_path, x_m=(0, 1, 2, 3, 40))).warnings == []  # 18.5 m a frame
+
+
+def test_a_turn_of_twenty_medians_is_a_jump_from_30_degrees_on(tmp_path: Path) -> None:
+    for last, count in ((26, 0), (38, 1)):  # degrees of one step; the other two have 1 and 0.5
+        scene = make_scene(tmp_path, angles_deg=(0, 1, 1 + last, 2, 3))
+        assert len(inspect_poses(scene).warnings) == count
+
+
+def test_a_camera_that_never_moves_is_an_error(tmp_path: Path) -> None:
+    (error,) = inspect_poses(make_scene(tmp_path, x_m=(2,) * 5)).errors
+    assert error.startswith("all 5 positions are [2. 0. 1.]; there is nothing to learn")
