@@ -83,7 +83,7 @@ def main(argv: list[str]) -> int:
         KeyboardInterrupt: Ctrl-C; the same command goes on.
     """
     own, overrides = _split_arguments(argv)
-    args = _build_parser().parse_args(own)
+    args = _build_sweep_parser().parse_args(own)
     # Imported here, so that `--help` does not wait for them.
     from lightning_pose.studies.figure_spec import parse_figure_spec
     from lightning_pose.sweeps.parent_run import close_parent, open_parent
@@ -231,7 +231,7 @@ def parse_value(text: str) -> Any:
     return text if misread else value
 
 
-def _build_parser() -> VerbParser:
+def _build_sweep_parser() -> VerbParser:
     parser = VerbParser(
         "sweep",
         usage="python -m lightning_pose sweep FILE [--n_trials N] [--workers W] [--SETTING VALUE ...]",
