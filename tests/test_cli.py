@@ -15,7 +15,7 @@ import yaml
 from lightning_pose.cli import PoseCLI
 from lightning_pose.data import ImageDataModule
 from lightning_pose.localization.localizer import Localizer
-from lightning_pose.sweeps.base_config import resolve
+from lightning_pose.sweeps.base_config import resolve_config
 from tests.helpers import Trained, Workplace
 
 DEAD_PROCESS = 2**22 + 1  # beyond the largest number that Linux gives
@@ -248,7 +248,7 @@ def test_older_class_paths_on_the_command_line(workplace: Workplace, joint: str)
 
 
 def test_a_sweep_reads_an_older_base_config(older_config: Path) -> None:
-    _, _, config = resolve(older_config, {"model.units": 4})
+    _, _, config = resolve_config(older_config, {"model.units": 4})
     assert config["data"]["class_path"] == "lightning_pose.data.ImageDataModule"
     assert config["data"]["init_args"]["extractor"]["class_path"] == "lightning_pose.features.SIFT"
     assert config["model"]["class_path"] == "lightning_pose.models.SurfLSTM"

@@ -1,4 +1,4 @@
-"""How the verbs outside Lightning's command line read their arguments: alike, and with one line for a mistake."""
+"""The argument parser of the verbs outside Lightning's command line: a mistake is one line."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ __all__ = ["VerbParser"]
 
 
 class VerbParser(argparse.ArgumentParser):
-    """A parser that raises ConfigError instead of printing its usage and leaving.
+    """A parser that raises ConfigError instead of printing its usage and ending the process.
 
     Args:
-        verb: what is said after `python -m lightning_pose`.
-        **kwargs: what argparse takes.
+        verb: what follows `python -m lightning_pose`.
+        **kwargs: of `argparse.ArgumentParser`.
     """
 
     def __init__(self, verb: str, **kwargs: Any) -> None:

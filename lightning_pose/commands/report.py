@@ -60,7 +60,7 @@ def main(argv: list[str]) -> int:
     Raises:
         ConfigError: an option does not do, there is no store, no run is left, or runs do not compare.
     """
-    args = _build_parser().parse_args(argv)
+    args = _build_report_parser().parse_args(argv)
     # Only now, so that `--help` is there at once.
     from lightning_pose.reports.baseline_rows import add_baselines
     from lightning_pose.reports.filters import Filters, select_runs
@@ -133,7 +133,7 @@ def _split_tag(text: str) -> tuple[str, str]:
     return name, value
 
 
-def _build_parser() -> VerbParser:
+def _build_report_parser() -> VerbParser:
     parser = VerbParser(
         "report",
         usage="python -m lightning_pose report [--format FORMAT] [--scene NAME ...] [--by NAME ...] [--published] ...",

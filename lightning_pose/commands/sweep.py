@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
+from collections.abc import Callable
 from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,7 +25,7 @@ if TYPE_CHECKING:  # Optuna and Lightning take seconds, and `--help` does withou
     from lightning_pose.sweeps.plan import Plan
     from lightning_pose.sweeps.workers import Job
 
-__all__ = ["main"]
+__all__ = ["main", "parse_value"]
 
 N_TRIALS = 20
 
@@ -35,13 +37,13 @@ HELP = """Search the settings of a config for what is best on its validation fra
   many machines, one study     ... --storage postgresql://USER:PASSWORD@HOST/DATABASE
   change what is not searched  ... --trainer.max_epochs 10
   train and test the best      fit --config mlruns/sweeps/STUDY/best.yaml
-  look at it as it goes        optuna-dashboard sqlite:///mlruns/optuna.db
+  follow its progress          optuna-dashboard sqlite:///mlruns/optuna.db
                                mlflow ui --backend-store-uri sqlite:///mlruns/mlflow.db
   a figure of the thesis       sweep sweeps/thesis/figure_4_5.yaml --data.root DIR
   less of it                   ... --space.model.neighbours "[1, 10, 40]" --trainer.max_epochs 20
 
-The same command goes on with the study, after Ctrl-C as after the last trial. A trial whose process dies is
-run again. Trials are runs nested in the study's, and keep no checkpoints."""
+The same command goes on with the study, after Ctrl-C as after the last trial. A trial whose process is
+killed is run again. Trials are runs nested in the study's, and keep no checkpoints."""
 
 FILE_HELP = """a sweep file:
 
@@ -77,37 +79,45 @@ def main(argv: list[str]) -> int:
     """Run the verb with the arguments after its name.
 
     Raises:
-        ConfigError: the sweep file, an option or the study does not do; or no trial has succeeded.
+        ConfigError: the sweep file, an option or the study is refused; or no trial has a value.
         KeyboardInterrupt: Ctrl-C; the same command goes on.
     """
-    own, overrides = _split(argv)
-    args = _parser().parse_args(own)
-    # Only now, so that `--help` is there at once.
+    own, overrides = _split_arguments(argv)
+    args = _build_sweep_parser().parse_args(own)
+    # Imported here, so that `--help` does not wait for them.
     from lightning_pose.studies.figure_spec import parse_figure_spec
     from lightning_pose.sweeps.parent_run import close_parent, open_parent
     from lightning_pose.sweeps.plan import read_plan
-    from lightning_pose.sweeps.storage import alone, shown
-    from lightning_pose.sweeps.study import enqueue_grid, is_grid, open_storage, open_study, recover, waiting
+    from lightning_pose.sweeps.storage import hide_password, lock_study
+    from lightning_pose.sweeps.study import (
+        count_waiting,
+        enqueue_grid,
+        is_grid,
+        open_storage,
+        open_study,
+        recover_trials,
+    )
     from lightning_pose.sweeps.workers import Job
 
     plan = read_plan(args.file, overrides)
     spec = parse_figure_spec(plan.figure, plan.measure, plan.space)  # checked before anything is trained
     name = args.study or f"{args.file.stem}-{plan.scene}"
     storage = open_storage(args.storage, plan.tracking[0])
-    with alone(storage, name):
+    with lock_study(storage, name):
         study = open_study(plan, name, storage)
         client, parent = open_parent(study, plan)
-        recover(study, storage, client)
+        recover_trials(study, storage, client)
         if is_grid(plan):
             enqueue_grid(study, plan)
     status = "KILLED"
     try:
         total = args.n_trials if args.n_trials is not None else plan.n_trials
         if is_grid(plan):
-            total = waiting(study) if total is None else min(total, waiting(study))
-        _run(study, plan, Job(plan, name, args.storage, parent), N_TRIALS if total is None else total, args.workers)
-        client, parent = open_parent(study, plan)  # another one, if someone has deleted it meanwhile
-        _conclude(study, plan, spec, client, parent, args.out or Path("mlruns") / "sweeps" / name)
+            total = min(count_waiting(study), math.inf if total is None else total)
+        total = N_TRIALS if total is None else int(total)
+        _run_trials(study, plan, Job(plan, name, args.storage, parent), total, args.workers)
+        client, parent = open_parent(study, plan)  # another one, if the user has deleted it meanwhile
+        _write_results(study, plan, spec, client, parent, args.out or Path("mlruns") / "sweeps" / name)
         status = "FINISHED"
     except KeyboardInterrupt as stop:
         raise KeyboardInterrupt("the same command goes on") from stop
@@ -116,71 +126,61 @@ def main(argv: list[str]) -> int:
         raise
     finally:
         close_parent(client, parent, study, status)
-    print(f"run {parent} in {plan.tracking[0]}\nstudy {name} in {shown(args.storage)}")
+    print(f"run {parent} in {plan.tracking[0]}\nstudy {name} in {hide_password(args.storage)}")
     return 0
 
 
-def _run(study: Study, plan: Plan, job: Job, total: int, workers: int) -> None:
+def _run_trials(study: Study, plan: Plan, job: Job, total: int, workers: int) -> None:
     """Run the trials under a progress bar that shows the best value so far."""
-    from lightning_pose.sweeps.workers import run_alone, run_together
+    from lightning_pose.sweeps.results import describe_best
+    from lightning_pose.sweeps.workers import run_here, run_in_processes
 
     console = Console(stderr=True)
     columns = (
         TextColumn("trial"), MofNCompleteColumn(), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn(),
         TextColumn("{task.description}", markup=False),
     )  # fmt: skip
-    done = 0
     with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
-        task = bar.add_task(_best_so_far(study, plan), total=total)
+        task = bar.add_task(describe_best(study, plan), total=total)
 
-        def finished() -> None:
-            nonlocal done
-            done += 1
-            text = _best_so_far(study, plan)
-            bar.update(task, completed=done, description=text)
+        def show_end() -> None:
+            text = describe_best(study, plan)
+            bar.update(task, advance=1, description=text)
             if not console.is_terminal:
-                print(f"trial {done}/{total}  {text}", file=sys.stderr, flush=True)
+                print(f"trial {bar.tasks[0].completed:.0f}/{total}  {text}", file=sys.stderr, flush=True)
 
         if workers == 1 or total < 2:
-            run_alone(job, total, finished)
+            run_here(job, total, show_end)
         else:
-            run_together(job, total, finished, workers)
+            run_in_processes(job, total, show_end, workers)
 
 
-def _best_so_far(study: Study, plan: Plan) -> str:
-    from lightning_pose.sweeps.results import best_trial
-
-    if not plan.comparable:
-        return ""
-    best = best_trial(study, plan)
-    if best is None:
-        return "no value yet"
-    pairs = zip(plan.objectives, best.values, strict=True)
-    return "best " + ", ".join(f"{o.metric} {value:.4g}" for o, value in pairs) + f" (trial {best.number})"
-
-
-def _conclude(
+def _write_results(
     study: Study, plan: Plan, spec: FigureSpec | None, client: MlflowClient, parent: str, folder: Path
 ) -> None:
-    """Print the best trials, and keep their config and figures in a folder and in the study's run."""
+    """Print the best trials; write their config and the figures to a folder and to the study's run.
+
+    Raises:
+        ConfigError: no trial has a value, or the figure shows what no trial has measured.
+    """
     from lightning_pose.runs.tags import REASON
-    from lightning_pose.studies.result import show_study
+    from lightning_pose.studies.result import write_study
     from lightning_pose.sweeps.parent_run import describe_parent
-    from lightning_pose.sweeps.results import best_trial, draw_figures, sheet, tally, write_best
+    from lightning_pose.sweeps.results import best_trial, build_sheet, count_states, draw_figures, write_best
 
     best = best_trial(study, plan)
     if best is None:
         trials = study.get_trials(deepcopy=False)
-        told = [trial.user_attrs[REASON] for trial in trials if REASON in trial.user_attrs]
-        why = f"the last: {told[-1]}" if told else "give --n_trials 1 or more"
-        if not told and trials:
-            why = "other commands run it; wait for them"
+        reasons = [trial.user_attrs[REASON] for trial in trials if REASON in trial.user_attrs]
+        why = "other commands run it; wait for them" if trials else "give --n_trials 1 or more"
+        if reasons:
+            why = f"the last: {reasons[-1]}"
         raise ConfigError(
-            f"no trial of {study.study_name} has ended with a value ({tally(study) or 'none ran'}); {why}"
+            f"no trial of {study.study_name} has ended with a value ({count_states(study) or 'none ran'}); {why}"
         )
     folder.mkdir(parents=True, exist_ok=True)
     config = None
-    if plan.comparable:  # first of all: what follows only shows it
+    if plan.comparable:  # before what may fail
         config = write_best(best, study, plan, folder)
         client.log_artifact(parent, str(config))
         client.set_tag(parent, "sweep.best_trial", str(best.number))
@@ -188,22 +188,22 @@ def _conclude(
             client.log_metric(parent, f"best/{objective.metric}", value)
     describe_parent(client, parent, study, plan)
     if plan.measure is None or spec is None:
-        sheet(study, plan).show()
-    if plan.measure is None:  # a study has a figure of its own
+        build_sheet(study, plan).show()
+    if plan.measure is None:  # other studies have a figure of their own only
         for file in draw_figures(study, plan, folder):
             client.log_artifact(parent, str(file), "figures")
-    files, rows = show_study(study, plan, spec, folder)
-    for file in files:
-        client.log_artifact(parent, str(file), "study")
-    if rows is not None:
-        rows.show()
-    print(f"{tally(study)}\nfigures and tables in {folder}")
+    if spec is not None:
+        files, table = write_study(study, plan, spec, folder)
+        for file in files:
+            client.log_artifact(parent, str(file), "study")
+        table.show()
+    print(f"{count_states(study)}\nfigures and tables in {folder}")
     if config is not None:
         print(f"the best on validation frames: python -m lightning_pose fit --config {config}")
 
 
-def _split(argv: list[str]) -> tuple[list[str], dict[str, Any]]:
-    """The verb's own words, and the settings of the config, whose names have dots."""
+def _split_arguments(argv: list[str]) -> tuple[list[str], dict[str, Any]]:
+    """The verb's own arguments, and the settings of the config, whose names have dots."""
     own: list[str] = []
     overrides: dict[str, Any] = {}
     words = iter(argv)
@@ -217,12 +217,12 @@ def _split(argv: list[str]) -> tuple[list[str], dict[str, Any]]:
         text = value if equals else next(words, None)
         if text is None:
             raise ConfigError(f"{word} has no value; give one")
-        overrides[name.replace(".init_args.", ".")] = _read_value(text)
+        overrides[name.replace(".init_args.", ".")] = parse_value(text)
     return own, overrides
 
 
-def _read_value(text: str) -> Any:
-    """YAML; but what it takes for a date, or for a number that is written otherwise, is a folder's name."""
+def parse_value(text: str) -> Any:
+    """A setting's value as YAML has it; a date or a number such as 00 is text, because it is a folder's name."""
     try:
         value = yaml.safe_load(text)
     except yaml.YAMLError:
@@ -231,7 +231,7 @@ def _read_value(text: str) -> Any:
     return text if misread else value
 
 
-def _parser() -> VerbParser:
+def _build_sweep_parser() -> VerbParser:
     parser = VerbParser(
         "sweep",
         usage="python -m lightning_pose sweep FILE [--n_trials N] [--workers W] [--SETTING VALUE ...]",
@@ -239,15 +239,19 @@ def _parser() -> VerbParser:
         epilog=FILE_HELP,
     )
     parser.add_argument("file", metavar="FILE", type=Path, help="sweep file, such as sweeps/surf_cnn.yaml")
-    parser.add_argument("--n_trials", type=_count(0), metavar="N", help="this many more (default: the file's, or 20)")
-    parser.add_argument("--workers", type=_count(1), metavar="W", default=1, help="processes (default: 1)")
+    parser.add_argument(
+        "--n_trials", type=_parse_count(0), metavar="N", help="this many more (default: the file's, or 20)"
+    )
+    parser.add_argument("--workers", type=_parse_count(1), metavar="W", default=1, help="processes (default: 1)")
     parser.add_argument("--storage", metavar="URL", default="sqlite:///mlruns/optuna.db", help="default: %(default)s")
     parser.add_argument("--study", metavar="NAME", help="default: the file's name and the scene's")
     parser.add_argument("--out", metavar="DIR", type=Path, help="default: mlruns/sweeps/STUDY")
     return parser
 
 
-def _count(least: int) -> Any:
+def _parse_count(least: int) -> Callable[[str], int]:
+    """A parser of whole numbers from `least` on, for argparse."""
+
     def whole(text: str) -> int:
         if not text.isdigit() or int(text) < least:
             raise argparse.ArgumentTypeError(f"is {text}, give {least} or more")

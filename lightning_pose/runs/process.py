@@ -1,29 +1,30 @@
-"""Processes by machine and number: which are gone, so that their runs can be closed."""
+"""Processes by machine and number: which have ended, so that their runs can be closed."""
 
 from __future__ import annotations
 
 import hashlib
 import os
 import socket
-import time
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import psutil
+
 if TYPE_CHECKING:
     from mlflow.entities import Run
 
-__all__ = ["HOST_TAG", "PROCESS_TAG", "has_died", "machine", "process_name", "process_tags"]
+__all__ = ["HOST_TAG", "PROCESS_TAG", "has_died", "has_owner_died", "identify_machine", "process_name", "process_tags"]
 
 HOST_TAG, PROCESS_TAG = "process.host", "process.id"
 
 
 @cache
-def machine() -> str:
+def identify_machine() -> str:
     """Name of this machine, with a digest that distinguishes it from others of that name and from its earlier boots.
 
-    Process numbers mean something within one boot only, and within one container where it counts its own.
+    Process numbers are unique within one boot only, or within one container.
     """
     facts = []
     with suppress(OSError):  # Linux alone has them
@@ -35,41 +36,27 @@ def machine() -> str:
 
 
 def process_name() -> str:
-    """This process, on whatever machine."""
-    return f"{machine()}:{os.getpid()}"
+    """The name of this process, unique among all machines."""
+    return f"{identify_machine()}:{os.getpid()}"
 
 
 def process_tags() -> dict[str, str]:
-    """Tags from which a later run finds out that this process has ended."""
-    return {HOST_TAG: machine(), PROCESS_TAG: str(os.getpid())}
+    """Tags by which a later run finds out whether this process has ended."""
+    return {HOST_TAG: identify_machine(), PROCESS_TAG: str(os.getpid())}
 
 
 def has_died(process: str) -> bool:
-    """Whether a process, by its `process_name`, was of this machine and is gone; of other machines nothing is known."""
+    """Whether a process, by its `process_name`, ran on this machine and has ended; False for other machines."""
     host, _, number = process.rpartition(":")
-    if host != machine():
-        return False
-    try:
-        os.kill(int(number), 0)
-    except ProcessLookupError:
-        return True
-    except PermissionError:
-        pass
-    return False
+    return host == identify_machine() and not psutil.pid_exists(int(number))
 
 
 def has_owner_died(run: Run) -> bool:
+    """Whether the process that a run belongs to, by its tags, ran on this machine and has ended."""
     tags = run.data.tags
     if HOST_TAG not in tags or PROCESS_TAG not in tags:
         return False
     host = tags[HOST_TAG]
-    if host != machine() and host.partition(" ")[0] == socket.gethostname():
-        return run.info.start_time / 1000 < _booted()  # before a power failure, say
+    if host != identify_machine() and host.partition(" ")[0] == socket.gethostname():
+        return run.info.start_time / 1000 < psutil.boot_time()  # before a power failure, for example
     return has_died(f"{host}:{tags[PROCESS_TAG]}")
-
-
-def _booted() -> float:
-    """When this machine started, in seconds since 1970; 0 where that is not known."""
-    if not hasattr(time, "CLOCK_BOOTTIME"):
-        return 0.0
-    return time.time() - time.clock_gettime(time.CLOCK_BOOTTIME)

@@ -1,14 +1,13 @@
-"""What a study ends in beside its best trial: one figure and one table of all that it measured."""
+"""The `figure` entry of a sweep file: what the study's figure and table show."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from lightning_pose.errors import ConfigError
 from lightning_pose.metrics.catalog import MEDIANS, find_metric
-from lightning_pose.sweeps.space import BASE, MEASURES, Parameter, nearest
+from lightning_pose.sweeps.space import BASE, MEASURES, Parameter, normalize_key, suggest_name
 
 __all__ = ["FigureSpec", "parse_figure_spec"]
 
@@ -42,11 +41,11 @@ class FigureSpec:
     labels: Mapping[str, str]
 
     def label(self, name: str) -> str:
-        """What a setting or a metric is called where it is shown."""
+        """The text for a setting or a metric on axes and in tables."""
         return self.labels.get(name) or _default_label(name)
 
 
-def parse_figure_spec(raw: Any, measure: str | None, space: Sequence[Parameter]) -> FigureSpec | None:
+def parse_figure_spec(raw: object, measure: str | None, space: Sequence[Parameter]) -> FigureSpec | None:
     """Read the `figure` of a sweep file; None where there is none.
 
     Raises:
@@ -58,36 +57,36 @@ def parse_figure_spec(raw: Any, measure: str | None, space: Sequence[Parameter])
         raise ConfigError(f"figure is {raw!r}; give {{x: model.layers, y: [test/position_median_m]}}")
     for field in raw:
         if field not in FIELDS:
-            raise ConfigError(f"figure has no entry {field!r}; {nearest(str(field), FIELDS)}")
+            raise ConfigError(f"figure has no entry {field!r}; {suggest_name(str(field), FIELDS)}")
     kind = raw.get("kind", "line")
     if kind not in KINDS:
-        raise ConfigError(f"figure.kind is {kind!r}; {nearest(str(kind), KINDS)}")
-    y = _names(raw.get("y", []), "y")
+        raise ConfigError(f"figure.kind is {kind!r}; {suggest_name(str(kind), KINDS)}")
+    y = _parse_names(raw.get("y", []), "y")
     if not y and kind != "pictures":
         y = tuple(f"{'test' if measure == 'test' else 'val'}/{name}" for name in MEDIANS)
-    table = _names(raw.get("table", []), "table")
+    table = _parse_names(raw.get("table", []), "table")
     for metric in (*y, *table):
         if not metric.startswith(MEASURES[measure]):
             raise ConfigError(
                 f"figure shows {metric}, but trials with `measure: {measure or 'null'}` have "
                 f"{', '.join(MEASURES[measure])} metrics; name one of these, or set measure"
             )
-    log = _names(raw.get("log", []), "log")
+    log = _parse_names(raw.get("log", []), "log")
     if not set(log) <= {"x", "y"}:
         raise ConfigError(f"figure.log is {list(log)}; give [x], [y] or [x, y]")
     return FigureSpec(
         kind=kind,
-        x=_axis(raw.get("x"), kind, space),
+        x=_parse_axis(raw.get("x"), kind, space),
         y=y,
         log=log,
-        beside=_names(raw.get("beside", []), "beside"),
+        beside=_parse_names(raw.get("beside", []), "beside"),
         title=raw.get("title"),
         table=table or (() if kind in ("curve", "pictures") else y),
-        labels=_labels(raw.get("labels") or {}),
+        labels=_parse_labels(raw.get("labels") or {}),
     )
 
 
-def _axis(x: Any, kind: str, space: Sequence[Parameter]) -> str:
+def _parse_axis(x: object, kind: str, space: Sequence[Parameter]) -> str:
     keys = [parameter.key for parameter in space]
     if kind in ("curve", "pictures"):
         if x is not None:
@@ -95,22 +94,22 @@ def _axis(x: Any, kind: str, space: Sequence[Parameter]) -> str:
                 f"figure.x is {x}, but a figure of kind {kind} has no setting along its axis; leave it out"
             )
         return ""
-    name = str(x).replace(".init_args.", ".")
+    name = normalize_key(x)
     if f"{name}.class_path" in keys:
         return f"{name}.class_path"
     if name not in keys:
-        raise ConfigError(f"figure.x is {x}, which is not searched; {nearest(name, keys)}")
+        raise ConfigError(f"figure.x is {x}, which is not searched; {suggest_name(name, keys)}")
     return name
 
 
-def _names(value: Any, field: str) -> tuple[str, ...]:
+def _parse_names(value: object, field: str) -> tuple[str, ...]:
     names = [value] if isinstance(value, str) else value
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise ConfigError(f"figure.{field} is {value!r}; give a list of names")
     return tuple(names)
 
 
-def _labels(raw: Any) -> dict[str, str]:
+def _parse_labels(raw: object) -> dict[str, str]:
     if not isinstance(raw, Mapping):
         raise ConfigError(f"figure.labels are {raw!r}; give them by name, as {{model.layers: convolutions}}")
     return {str(name): str(label) for name, label in raw.items()}

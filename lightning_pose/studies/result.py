@@ -1,4 +1,4 @@
-"""What a study ends in: its figure and its table, as files."""
+"""The results of a study as files: its figure and its table."""
 
 from __future__ import annotations
 
@@ -9,62 +9,67 @@ from optuna import Study
 
 from lightning_pose.errors import ConfigError
 from lightning_pose.features.keypoint_statistics import FrameKeypoints, read_frame_keypoints
-from lightning_pose.studies.figure import draw_cells, draw_keypoints
+from lightning_pose.studies.figure import draw_groups, draw_keypoints
 from lightning_pose.studies.figure_spec import FigureSpec
-from lightning_pose.studies.table import Cell, as_csv, as_markdown, as_sheet, gather, varying
+from lightning_pose.studies.table import Group, build_rows, read_groups, varying_settings, write_csv
 from lightning_pose.sweeps.base_config import ParsedConfig, open_keypoint_data
 from lightning_pose.sweeps.plan import Plan
-from lightning_pose.sweeps.space import SCENE, nearest
+from lightning_pose.sweeps.space import SCENE, suggest_name
 from lightning_pose.terminal import Sheet
 
-__all__ = ["show_study"]
+__all__ = ["write_markdown", "write_study"]
 
 
-def show_study(study: Study, plan: Plan, spec: FigureSpec | None, folder: Path) -> tuple[list[Path], Sheet | None]:
+def write_study(study: Study, plan: Plan, spec: FigureSpec, folder: Path) -> tuple[list[Path], Sheet]:
     """Draw a study's figure, and write its table as `table.md` and, with all that was measured, as `table.csv`.
 
     Returns:
-        The files, and the table for the terminal; none for pictures, which have no numbers.
+        The files, and the table for the terminal.
 
     Raises:
-        ConfigError: it is to show what no trial has measured.
+        ConfigError: the figure shows what no trial has measured.
     """
-    if spec is None:
-        return [], None
-    cells = gather(study, plan)
-    _check_measured(cells, spec)
+    groups = read_groups(study, plan)
+    _check_measured(groups, spec)
     title = spec.title or study.study_name
-    if SCENE not in varying(cells):  # where it does, the scenes are named beside their curves
+    if SCENE not in varying_settings(groups):  # where it varies, the figure names the scenes
         title = f"{title}, {plan.scene}"
-    figure = folder / "figure.png"
+    ended = [group for group in groups if group.metrics]
     if spec.kind == "pictures":
-        shown = [cell for cell in cells if cell.metrics]
-        frames = [_read_keypoints(plan, cell) for cell in shown]
-        names = [
-            cell.names[SCENE] if cell.values.get(SCENE) else frame.scene
-            for cell, frame in zip(shown, frames, strict=True)
-        ]
-        draw_keypoints(dict(zip(names, frames, strict=True)), title).savefig(figure)
+        figure = draw_keypoints(dict(_read_keypoints(plan, group) for group in ended), title)
     else:
-        draw_cells(cells, spec, title).savefig(figure)
-    (folder / "table.csv").write_text(as_csv(cells, plan))
-    (folder / "table.md").write_text(as_markdown(cells, spec))
-    return [figure, folder / "table.csv", folder / "table.md"], as_sheet(cells, spec, title)
+        figure = draw_groups(ended, spec, title)
+    heads, rows = build_rows(groups, spec)
+    files = [folder / name for name in ("figure.png", "table.csv", "table.md")]
+    figure.savefig(files[0])
+    files[1].write_text(write_csv(groups, plan))
+    files[2].write_text(write_markdown(heads, rows))
+    return files, Sheet(title, heads, rows)
 
 
-def _read_keypoints(plan: Plan, cell: Cell) -> FrameKeypoints:
-    data, images = open_keypoint_data(ParsedConfig(plan.arguments(cell.values)))
-    return read_frame_keypoints(data.cache, data.scene.name, images)
+def write_markdown(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table as GitHub's Markdown."""
+    lines = [heads, ["---"] * len(heads), *rows]
+    return "".join("| " + " | ".join(text.replace("|", "\\|") for text in line) + " |\n" for line in lines)
 
 
-def _check_measured(cells: Sequence[Cell], spec: FigureSpec) -> None:
-    held = [found for cell in cells for found in (*cell.metrics, *cell.curves)]
-    known = sorted(set[str]().union(*held))
+def _read_keypoints(plan: Plan, group: Group) -> tuple[str, FrameKeypoints]:
+    """The name of a group's scene, and the keypoints of one of its frames."""
+    data, images = open_keypoint_data(ParsedConfig(plan.arguments(group.values)))
+    frame = read_frame_keypoints(data.cache, data.scene.name, images)
+    return group.names[SCENE] if group.values.get(SCENE) else frame.scene, frame
+
+
+def _check_measured(groups: Sequence[Group], spec: FigureSpec) -> None:
+    known = sorted({name for group in groups for found in (*group.metrics, *group.curves) for name in found})
     baselines = sorted({name.split("/")[1] for name in known if name.startswith("baseline/")})
-    again = "correct the file, and the same command draws what there is"
+    remedy = "correct the file, and the same command draws what there is"
     for name in (*spec.y, *spec.table):
         if name not in known:
-            raise ConfigError(f"figure shows {name}, which no trial has measured ({nearest(name, known)}); {again}")
+            why = f"which no trial has measured ({suggest_name(name, known)})"
+            raise ConfigError(f"figure shows {name}, {why}; {remedy}")
     for name in spec.beside:
         if name not in baselines:
-            raise ConfigError(f"figure.beside has {name}, which is no baseline ({nearest(name, baselines)}); {again}")
+            raise ConfigError(
+                f"figure.beside has {name}, which is no baseline ({suggest_name(name, baselines)}); {remedy}"
+            )

@@ -1,5 +1,5 @@
-"""Hyperparameter search: a sweep file (`plan`, `space`), its trials (`trial`), who runs them (`study`, `workers`),
-and what is left of them (`record`, `results`).
+"""Hyperparameter search: a sweep file (`plan`, `space`), its trials (`trial`), their study (`storage`, `study`), the
+processes that run them (`workers`), and the results (`parent_run`, `results`).
 
 Objectives are measured on validation frames alone. Nothing is imported here: Optuna and Lightning take seconds.
 """

@@ -1,4 +1,4 @@
-"""The study's own MLflow run, which holds those of its trials."""
+"""The MLflow run of a study; the runs of its trials are nested in it."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from optuna.trial import TrialState
 from lightning_pose.runs.logger import MLflowLogger
 from lightning_pose.runs.tags import RUN
 from lightning_pose.sweeps.plan import Plan
-from lightning_pose.sweeps.results import SHOWN, best_trials, short, tally
+from lightning_pose.sweeps.results import SHOWN, best_trials, count_states, format_value
 
 __all__ = ["close_parent", "close_run", "describe_parent", "open_parent"]
 
 
 def open_parent(study: Study, plan: Plan) -> tuple[MlflowClient, str]:
-    """The MLflow run that holds the trials: the study's own, reopened, or a new one.
+    """Reopen the study's MLflow run, or create it.
 
     Returns:
         A client, and the run's id.
@@ -24,10 +24,10 @@ def open_parent(study: Study, plan: Plan) -> tuple[MlflowClient, str]:
     uri, experiment = plan.tracking
     logger = plan.resolved["trainer"]["logger"]["init_args"]
     kept = study.user_attrs.get(RUN)
-    if kept is not None and not _exists(MlflowClient(uri), kept):
+    if kept is not None and not _run_exists(MlflowClient(uri), kept):
         kept = None  # another MLflow store than last time
-    record = MLflowLogger(experiment, run_name=study.study_name, tracking_uri=uri, run_id=kept, root=logger["root"])
-    client, run = record.client, str(record.run_id)
+    opened = MLflowLogger(experiment, run_name=study.study_name, tracking_uri=uri, run_id=kept, root=logger["root"])
+    client, run = opened.client, str(opened.run_id)
     client.update_run(run, status="RUNNING")
     if kept is None:
         study.set_user_attr(RUN, run)
@@ -50,30 +50,34 @@ def open_parent(study: Study, plan: Plan) -> tuple[MlflowClient, str]:
 def describe_parent(client: MlflowClient, run: str, study: Study, plan: Plan) -> None:
     """Make a table of the best trials the description of the study's run."""
     names = [objective.metric for objective in plan.objectives]
-    lines = [f"{tally(study)}\n", f"| trial | {' | '.join(names)} | settings |", f"|---|{'---|' * len(names)}---|"]
+    lines = [
+        f"{count_states(study)}\n",
+        f"| trial | {' | '.join(names)} | settings |",
+        f"|---|{'---|' * len(names)}---|",
+    ]
     for trial in best_trials(study, plan)[:SHOWN]:
-        values = " | ".join(short(value) for value in trial.values)
+        values = " | ".join(format_value(value) for value in trial.values)
         # In one column, which wraps: a wide table pushes the rest off MLflow's page.
-        settings = ", ".join(f"{key.partition('.')[2]} {short(value)}" for key, value in trial.params.items())
+        settings = ", ".join(f"{key.partition('.')[2]} {format_value(value)}" for key, value in trial.params.items())
         lines.append(f"| {trial.number} | {values} | {settings} |")
     client.set_tag(run, "mlflow.note.content", "\n".join(lines))
 
 
 def close_parent(client: MlflowClient, run: str, study: Study, status: str) -> None:
-    """End the study's run, unless another command has a trial under way, which ends it then."""
-    if not study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)) and _exists(client, run):
+    """End the study's run, unless another command runs a trial; that command ends it then."""
+    if not study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)) and _run_exists(client, run):
         client.set_terminated(run, status)
 
 
 def close_run(client: MlflowClient, run: str | None, reason: str) -> None:
-    """Mark the run of a trial whose process is gone; None where it had none yet."""
-    if run is not None and _exists(client, run):
+    """Mark the run of a trial whose process is gone; nothing is done where it has no run yet."""
+    if run is not None and _run_exists(client, run):
         client.set_tag(run, "sweep.state", "FAILED")
         client.set_tag(run, "sweep.reason", reason)
         client.set_terminated(run, "KILLED")
 
 
-def _exists(client: MlflowClient, run: str) -> bool:
+def _run_exists(client: MlflowClient, run: str) -> bool:
     try:
         return client.get_run(run).info.lifecycle_stage == "active"
     except MlflowException:

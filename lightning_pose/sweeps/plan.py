@@ -11,8 +11,18 @@ from typing import Any
 from lightning_pose.errors import ConfigError
 from lightning_pose.metrics import catalog
 from lightning_pose.paths import default_tracking_uri
-from lightning_pose.sweeps.base_config import ParsedConfig, check_known, keys, options, put, read_yaml, resolve
-from lightning_pose.sweeps.space import BASE, MEASURES, Parameter, by_class_path, check_when, nearest, parse_space
+from lightning_pose.sweeps.base_config import ParsedConfig, change_value, check_settings, read_yaml, write_options
+from lightning_pose.sweeps.space import (
+    BASE,
+    MEASURES,
+    Config,
+    Parameter,
+    Settings,
+    check_when,
+    normalize_key,
+    parse_space,
+    suggest_name,
+)
 
 __all__ = ["MEASURES", "Objective", "Plan", "read_plan"]
 
@@ -33,15 +43,15 @@ class Objective:
 
 @dataclass(frozen=True)
 class Plan:
-    """What a sweep does.
+    """A sweep file, read and checked.
 
     Attributes:
         file: the sweep file.
-        bases: the base configs by name; where there are several, the parameter `base` says which a trial has.
+        bases: the base configs by name; where there are several, the parameter `base` names that of a trial.
         objectives: one or several.
         sampler: name and options.
         pruner: name and options.
-        n_trials: how many a command runs, if it does not say so itself.
+        n_trials: how many a command runs without `--n_trials`.
         seed: of the sampler.
         settings: what is fixed for all trials on top of the base config, by dotted key.
         space: what is searched.
@@ -54,15 +64,15 @@ class Plan:
     file: Path
     bases: Mapping[str, Path]
     objectives: tuple[Objective, ...]
-    sampler: Mapping[str, Any]
-    pruner: Mapping[str, Any]
+    sampler: Settings
+    pruner: Settings
     n_trials: int | None
     seed: int
-    settings: Mapping[str, Any]
+    settings: Settings
     space: tuple[Parameter, ...]
     measure: str | None
     figure: Any
-    resolved: Mapping[str, Any]
+    resolved: Settings
 
     @property
     def scene(self) -> str:
@@ -88,28 +98,28 @@ class Plan:
         logger = self.resolved["trainer"]["logger"]["init_args"]
         return logger["tracking_uri"] or default_tracking_uri(logger["root"]), logger["experiment_name"]
 
-    def base(self, values: Mapping[str, Any]) -> Path:
+    def base(self, values: Settings) -> Path:
         """The base config of a trial."""
         return self.bases[values.get(BASE, next(iter(self.bases)))]
 
-    def changes(self, values: Mapping[str, Any]) -> dict[str, Any]:
+    def changes(self, values: Settings) -> Config:
         """The settings of a trial on top of its base config: the sweep's and its own."""
         return {**self.settings, **{key: value for key, value in values.items() if key != BASE}}
 
-    def arguments(self, values: Mapping[str, Any]) -> list[str]:
+    def arguments(self, values: Settings) -> list[str]:
         """The command line of a trial, without its verb: base config, settings, and the trial's values."""
-        return ["--config", str(self.base(values)), *options(self.changes(values))]
+        return ["--config", str(self.base(values)), *write_options(self.changes(values))]
 
-    def config(self, values: Mapping[str, Any]) -> dict[str, Any]:
+    def config(self, values: Settings) -> Config:
         """The base config with settings and values put in, as a config file has it."""
         config = read_yaml(self.base(values), "base config")
         full = ParsedConfig(self.arguments(values)).config.as_dict()
         for key, value in self.changes(values).items():
-            put(config, full, key.split("."), value)
+            change_value(config, full, key.split("."), value)
         return config
 
     def describe(self) -> dict[str, str]:
-        """What a study cannot change between two commands: the space, the objectives, and what the trials share."""
+        """What must not change between two commands of a study, as JSON by its name in messages."""
         configs = {name: read_yaml(file, "base config") for name, file in self.bases.items()}
         fixed = {"configs": configs, "settings": dict(self.settings), "measure": self.measure}
         return {
@@ -119,13 +129,13 @@ class Plan:
         }
 
 
-def read_plan(file: Path, overrides: Mapping[str, Any]) -> Plan:
+def read_plan(file: Path, overrides: Settings) -> Plan:
     """Read a sweep file and check every part of it.
 
     Args:
         file: YAML.
-        overrides: settings of the command line, which win over the file's: one that is searched is searched no more,
-            and `space.KEY` replaces what is searched of a key.
+        overrides: settings of the command line, which replace the file's: one that is searched is fixed instead, and
+            `space.KEY` replaces the values that are searched.
 
     Raises:
         ConfigError: the file or a base config is missing or malformed, a key is unknown, or a value is refused.
@@ -133,16 +143,16 @@ def read_plan(file: Path, overrides: Mapping[str, Any]) -> Plan:
     raw = read_yaml(file, "sweep file")
     for field in raw:
         if field not in FIELDS:
-            raise ConfigError(f"{file} has an unknown entry {field!r}; {nearest(str(field), FIELDS)}")
+            raise ConfigError(f"{file} has an unknown entry {field!r}; {suggest_name(str(field), FIELDS)}")
     bases = _find_bases(file, raw.get("base"))
     measure = raw.get("measure")
     if not isinstance(measure, str | None) or measure not in MEASURES:
         raise ConfigError(f"measure is {measure!r}; give test or features, or leave it out")
-    settings = _settings(raw.get("settings"))
-    space = _space(raw.get("space"), bases, overrides)
+    settings = _parse_settings(raw.get("settings"))
+    space = _narrow_space(raw.get("space"), bases, overrides)
     searched = {parameter.key for parameter in space}
     settings |= {k: value for k, value in overrides.items() if not k.startswith("space.") and k not in searched}
-    settings, configs, space = _check_keys(bases, settings, space)
+    settings, configs, space = check_settings(bases, settings, space)
     resolved = configs[0]
     alike = len({json.dumps(config["model"]["init_args"].get("loss"), default=str) for config in configs}) == 1
     usual = FEATURES[0] if measure == "features" else "val/loss" if alike else "val/position_median_m"
@@ -150,10 +160,10 @@ def read_plan(file: Path, overrides: Mapping[str, Any]) -> Plan:
         file=file,
         bases=bases,
         objectives=_parse_objectives(raw.get("objective", usual), measure),
-        sampler=_named(raw.get("sampler", "tpe"), "sampler"),
-        pruner=_named(raw.get("pruner", "none" if measure else "default"), "pruner"),
-        n_trials=_whole(raw.get("n_trials"), "n_trials"),
-        seed=_whole(raw.get("seed"), "seed") or 0,
+        sampler=_parse_named(raw.get("sampler", "tpe"), "sampler"),
+        pruner=_parse_named(raw.get("pruner", "none" if measure else "default"), "pruner"),
+        n_trials=_check_whole(raw.get("n_trials"), "n_trials"),
+        seed=_check_whole(raw.get("seed"), "seed") or 0,
         settings=settings,
         space=tuple(space),
         measure=measure,
@@ -172,17 +182,17 @@ def read_plan(file: Path, overrides: Mapping[str, Any]) -> Plan:
     return plan
 
 
-def _settings(raw: Any) -> dict[str, Any]:
+def _parse_settings(raw: object) -> Config:
     if not isinstance(raw, Mapping | None):
         raise ConfigError(f"settings are {raw!r}; give them by name, as {{trainer.max_epochs: 10}}")
-    return {str(key).replace(".init_args.", "."): value for key, value in (raw or {}).items()}
+    return {normalize_key(key): value for key, value in (raw or {}).items()}
 
 
-def _find_bases(file: Path, entry: Any) -> dict[str, Path]:
+def _find_bases(file: Path, entry: object) -> dict[str, Path]:
     entries = entry if isinstance(entry, list) else [entry]
     if not entries or not all(isinstance(name, str) for name in entries):
         raise ConfigError(f"{file} names no base config; add a line such as `base: configs/surf_cnn.yaml`")
-    found = [_find_base(file, name) for name in entries]
+    found = [_find_base(file, str(name)) for name in entries]
     bases = {path.stem: path for path in found}
     if len(bases) < len(found):
         raise ConfigError(f"{file} names base configs of the same file name, {', '.join(map(str, found))}; rename one")
@@ -196,14 +206,12 @@ def _find_base(file: Path, base: str) -> Path:
     raise ConfigError(f"{file} names the base config {base}, which is not there; give its path from the sweep file")
 
 
-def _space(raw: Any, bases: Mapping[str, Path], overrides: Mapping[str, Any]) -> list[Parameter]:
+def _narrow_space(raw: object, bases: Mapping[str, Path], overrides: Settings) -> list[Parameter]:
     """The search space, with the base config as its first parameter where there are several."""
-    entries = (
-        {str(key).replace(".init_args.", "."): entry for key, entry in raw.items()} if isinstance(raw, dict) else {}
-    )
+    entries = {normalize_key(key): entry for key, entry in raw.items()} if isinstance(raw, dict) else {}
     if len(bases) > 1:
         entries = {BASE: list(bases), **entries}
-    if entries:  # as the file has it: narrowed, a parameter may lack what another waits for
+    if entries:  # before it is narrowed: then a choice may be missing that a `when` names
         check_when(parse_space(entries))
     for key, value in overrides.items():
         name = key.removeprefix("space.")
@@ -212,12 +220,13 @@ def _space(raw: Any, bases: Mapping[str, Path], overrides: Mapping[str, Any]) ->
         elif name == key:
             continue
         before = entries.get(name)
-        keeps_when = isinstance(before, Mapping) and "when" in before and isinstance(value, list)
-        entries[name] = {"choices": value, "when": before["when"]} if keeps_when else value  # type: ignore[index]
+        if isinstance(before, Mapping) and "when" in before and isinstance(value, list):
+            value = {"choices": value, "when": before["when"]}
+        entries[name] = value
     return parse_space(entries or raw)
 
 
-def _named(entry: Any, what: str) -> dict[str, Any]:
+def _parse_named(entry: object, what: str) -> Config:
     """`tpe` or `{name: tpe, n_startup_trials: 5}`."""
     named = {"name": entry} if isinstance(entry, str) else entry
     if not isinstance(named, dict) or not isinstance(named.get("name"), str):
@@ -225,13 +234,13 @@ def _named(entry: Any, what: str) -> dict[str, Any]:
     return named
 
 
-def _whole(value: Any, what: str) -> int | None:
+def _check_whole(value: object, what: str) -> int | None:
     if value is not None and (not isinstance(value, int) or isinstance(value, bool) or value < 0):
         raise ConfigError(f"{what} is {value!r}; give a whole number, 0 or more")
     return value
 
 
-def _parse_objectives(raw: Any, measure: str | None) -> tuple[Objective, ...]:
+def _parse_objectives(raw: object, measure: str | None) -> tuple[Objective, ...]:
     entries = raw if isinstance(raw, list) else [raw]
     if not entries:
         raise ConfigError("objective is empty; give val/loss, or leave it out")
@@ -240,7 +249,7 @@ def _parse_objectives(raw: Any, measure: str | None) -> tuple[Objective, ...]:
     )
 
 
-def _parse_objective(entry: Any, known: Sequence[str]) -> Objective:
+def _parse_objective(entry: object, known: Sequence[str]) -> Objective:
     named = {"metric": entry} if isinstance(entry, str) else entry
     if not isinstance(named, dict) or not isinstance(named.get("metric"), str) or named.keys() - {"metric", "goal"}:
         raise ConfigError(f"objective is {entry!r}; give a metric, or {{metric: val/loss, goal: minimize}}")
@@ -248,45 +257,9 @@ def _parse_objective(entry: Any, known: Sequence[str]) -> Objective:
     if metric.startswith(("test/", "baseline/")):
         raise ConfigError(f"objective {metric} is measured on test frames, which must not choose; take its val/ name")
     if metric not in known:
-        raise ConfigError(f"objective {metric} is not known; {nearest(metric, known)}")
+        raise ConfigError(f"objective {metric} is not known; {suggest_name(metric, known)}")
     known_metric = catalog.find_metric(metric)
     goal = named.get("goal", "maximize" if known_metric and known_metric.higher_is_better else "minimize")
     if goal not in ("minimize", "maximize"):
         raise ConfigError(f"objective {metric} has goal {goal!r}; give minimize or maximize")
     return Objective(metric, goal == "maximize")
-
-
-def _check_keys(
-    bases: Mapping[str, Path], settings: Mapping[str, Any], space: Sequence[Parameter]
-) -> tuple[dict[str, Any], list[dict[str, Any]], list[Parameter]]:
-    """Every key exists, in its base config or under a class that is searched, and has values of the right type.
-
-    Returns:
-        The settings and the space, a class by the name of its `class_path`, and each base's whole config.
-    """
-    found = {name: resolve(file, settings) for name, file in bases.items()}
-    known = set[str]().union(*(keys(resolved) for _, _, resolved in found.values()))
-    space = by_class_path(space, known)
-    for name, (cli, named, resolved) in found.items():
-        own = [p for p in space if p.key != BASE and name in (p.when or {}).get(BASE, (name,))]
-        _check_base(bases[name], cli, named, resolved, own)
-    return next(iter(found.values()))[1], [resolved for _, _, resolved in found.values()], space
-
-
-def _check_base(
-    base: Path, cli: ParsedConfig, named: Mapping[str, Any], resolved: Mapping[str, Any], own: Sequence[Parameter]
-) -> None:
-    known = keys(cli.config.as_dict()) | keys(resolved)
-    classes = [parameter for parameter in own if parameter.key.endswith(".class_path")]
-    for parameter in classes:
-        for choice in parameter.example():
-            known |= keys(cli.parse(["--config", str(base), *options({**named, parameter.key: choice})]))
-    for parameter in own:
-        check_known(parameter.key, known, "space.")
-        if classes or set(parameter.when or ()) - {BASE}:
-            continue  # it may suit some trials alone, which say so
-        for value in parameter.example():
-            try:
-                cli.parse(["--config", str(base), *options({**named, parameter.key: value})])
-            except ConfigError as error:
-                raise ConfigError(f"space.{parameter.key} cannot be {value!r}: {error}") from error

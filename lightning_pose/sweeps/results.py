@@ -1,9 +1,11 @@
-"""What a sweep leaves: the best config, figures, a table of the best trials, and a study's own figure and table."""
+"""The results of a sweep: its best trials, the best config, and Optuna's figures."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,21 +15,29 @@ from optuna.trial import FrozenTrial, TrialState
 
 from lightning_pose.runs.tags import REASON
 from lightning_pose.sweeps.plan import Objective, Plan
+from lightning_pose.sweeps.space import Config
 from lightning_pose.terminal import Sheet
 
-__all__ = ["SHOWN", "best_trial", "best_trials", "completed", "draw_figures", "sheet", "short", "tally", "write_best"]
+__all__ = [
+    "SHOWN",
+    "best_trial",
+    "best_trials",
+    "build_sheet",
+    "count_states",
+    "describe_best",
+    "draw_figures",
+    "format_value",
+    "plan_figures",
+    "write_best",
+]
 
 SHOWN = 10
 
 
-def completed(study: Study) -> list[FrozenTrial]:
-    """Trials with a value, in order."""
-    return study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
-
-
 def best_trials(study: Study, plan: Plan) -> list[FrozenTrial]:
-    """The best first: by value, or for several objectives those that none beats in all, by the first objective."""
-    found = completed(study) if len(plan.objectives) == 1 else study.best_trials
+    """Completed trials, the best first; for several objectives the Pareto front, by the first objective."""
+    complete = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+    found = complete if len(plan.objectives) == 1 else study.best_trials
     return sorted(found, key=lambda trial: trial.values[0], reverse=plan.objectives[0].maximize)
 
 
@@ -36,10 +46,19 @@ def best_trial(study: Study, plan: Plan) -> FrozenTrial | None:
     return next(iter(best_trials(study, plan)), None)
 
 
-def tally(study: Study) -> str:
+def describe_best(study: Study, plan: Plan) -> str:
+    """The best trial so far in words; empty where trials cannot be compared."""
+    best = best_trial(study, plan)
+    if best is None or not plan.comparable:
+        return "no value yet" if plan.comparable else ""
+    pairs = zip(plan.objectives, best.values, strict=True)
+    return "best " + ", ".join(f"{o.metric} {value:.4g}" for o, value in pairs) + f" (trial {best.number})"
+
+
+def count_states(study: Study) -> str:
     """How many trials ended how, as `5 complete, 1 pruned`."""
-    states = [trial.state.name.lower() for trial in study.get_trials(deepcopy=False)]
-    return ", ".join(f"{states.count(name)} {name}" for name in dict.fromkeys(sorted(states)))
+    states = Counter(trial.state.name.lower() for trial in study.get_trials(deepcopy=False))
+    return ", ".join(f"{number} {state}" for state, number in sorted(states.items()))
 
 
 def write_best(trial: FrozenTrial, study: Study, plan: Plan, folder: Path) -> Path:
@@ -53,14 +72,14 @@ def write_best(trial: FrozenTrial, study: Study, plan: Plan, folder: Path) -> Pa
     return file
 
 
-def sheet(study: Study, plan: Plan) -> Sheet:
-    """The best trials, and why the last ones that broke did."""
+def build_sheet(study: Study, plan: Plan) -> Sheet:
+    """A table of the best trials, with the reason of the last failure below it."""
     several = len(plan.objectives) > 1
     keys = [parameter.key for parameter in plan.space]
     heads = ["trial", *(objective.metric for objective in plan.objectives), *_last_names(keys)]
     rows = []
     for trial in best_trials(study, plan)[:SHOWN]:
-        params = [short(trial.params.get(key, "")) for key in keys]
+        params = [format_value(trial.params.get(key, "")) for key in keys]
         rows.append([str(trial.number), *(f"{value:.4g}" for value in trial.values), *params])
     failed = [t for t in study.get_trials(deepcopy=False, states=(TrialState.FAIL,)) if REASON in t.user_attrs]
     caption = f"trial {failed[-1].number} failed: {failed[-1].user_attrs[REASON]}" if failed else None
@@ -68,12 +87,13 @@ def sheet(study: Study, plan: Plan) -> Sheet:
 
 
 def _last_names(keys: list[str]) -> list[str]:
-    """Keys without what they are in, where that leaves them apart: a terminal is narrow."""
+    """The last part of each key where it is unique, else the whole key: a terminal is narrow."""
     last = [key.rpartition(".")[2] for key in keys]
     return [name if last.count(name) == 1 else key for name, key in zip(last, keys, strict=True)]
 
 
-def short(value: Any) -> str:
+def format_value(value: object) -> str:
+    """A number in four digits, anything else as it is."""
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
@@ -86,7 +106,7 @@ def draw_figures(study: Study, plan: Plan, folder: Path) -> list[Path]:
 
     plt.switch_backend("Agg")  # no display is needed
     files = []
-    for name, draw in _figures(study, plan):
+    for name, draw in plan_figures(study, plan.objectives):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Optuna warns that these are experimental
             try:
@@ -102,27 +122,26 @@ def draw_figures(study: Study, plan: Plan, folder: Path) -> list[Path]:
     return files
 
 
-def _figures(study: Study, plan: Plan) -> Iterator[tuple[str, Callable[[], Any]]]:
+def plan_figures(study: Study, objectives: Sequence[Objective]) -> Iterator[tuple[str, Callable[[], Any]]]:
+    """Optuna's figures of a study: the name of each, and a function that draws it."""
     from optuna.visualization import matplotlib as draw
 
-    done = completed(study)
-    for i, objective in enumerate(plan.objectives):
-        named: dict[str, Any] = {"target_name": objective.metric}
-        weighed = named
-        if len(plan.objectives) > 1:  # with one, Optuna knows which way is better, and draws the best so far
-            named = named | {"target": lambda trial, i=i: trial.values[i]}
-            sign = -1 if objective.maximize else 1  # what matters for the best trials, which it takes for the lowest
-            weighed = named | {"target": lambda trial, i=i, sign=sign: sign * trial.values[i]}
-        end = f"_{_file_name(objective)}" if len(plan.objectives) > 1 else ""
-        yield f"history{end}", lambda named=named: draw.plot_optimization_history(study, **named)
-        yield f"slice{end}", lambda named=named: draw.plot_slice(study, **named)
-        yield f"parallel_coordinate{end}", lambda named=named: draw.plot_parallel_coordinate(study, **named)
-        if len({trial.values[i] for trial in done}) > 1:
-            yield f"importance{end}", lambda named=weighed: draw.plot_param_importances(study, **named)
-    if len(plan.objectives) in (2, 3):
-        names = [objective.metric for objective in plan.objectives]
-        yield "pareto_front", lambda: draw.plot_pareto_front(study, target_names=names)
-
-
-def _file_name(objective: Objective) -> str:
-    return objective.metric.replace("/", "_")
+    kinds: dict[str, Callable[..., Any]] = {
+        "history": draw.plot_optimization_history,
+        "slice": draw.plot_slice,
+        "parallel_coordinate": draw.plot_parallel_coordinate,
+        "importance": draw.plot_param_importances,
+    }
+    for i, objective in enumerate(objectives):
+        values = {trial.values[i] for trial in study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))}
+        for name, draw_kind in kinds.items():
+            options: Config = {"target_name": objective.metric}
+            if len(objectives) > 1:  # for one, Optuna takes the direction of the study, and draws the best so far
+                # Importance is that for the lowest targets.
+                sign = -1 if name == "importance" and objective.maximize else 1
+                options["target"] = lambda trial, i=i, sign=sign: sign * trial.values[i]
+                name = f"{name}_{objective.metric.replace('/', '_')}"
+            if not name.startswith("importance") or len(values) > 1:
+                yield name, partial(draw_kind, study, **options)
+    if len(objectives) in (2, 3):
+        yield "pareto_front", partial(draw.plot_pareto_front, study, target_names=[o.metric for o in objectives])

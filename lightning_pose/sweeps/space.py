@@ -5,8 +5,8 @@ from __future__ import annotations
 import itertools
 import json
 import math
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Container, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
 
@@ -22,16 +22,23 @@ __all__ = [
     "MEASURES",
     "SCENE",
     "SEED",
+    "Config",
     "Parameter",
-    "by_class_path",
+    "Settings",
     "check_when",
-    "draw",
-    "grid",
-    "nearest",
+    "draw_values",
+    "list_grid",
+    "name_classes",
+    "normalize_key",
     "parse_space",
+    "suggest_name",
 ]
 
 Scalar = str | int | float | bool | None
+Settings = Mapping[str, Any]
+"""Values as YAML has them, of settings by dotted name or of a whole config."""
+Config = dict[str, Any]
+"""Such values that may be changed."""
 
 KINDS = ("float", "int", "categorical")
 FIELDS = {"type", "low", "high", "step", "log", "choices", "when"}
@@ -60,14 +67,14 @@ class Parameter:
     step: float | None = None
     log: bool = False
     choices: Mapping[Scalar, Any] | None = None
-    when: Mapping[str, tuple[Any, ...]] | None = None
+    when: Mapping[str, tuple[Any, ...]] = field(default_factory=dict)
 
-    def active(self, values: Mapping[str, Any]) -> bool:
+    def active(self, values: Settings) -> bool:
         """Whether it is searched, given the values of the parameters before it."""
-        return all(key in values and values[key] in wanted for key, wanted in (self.when or {}).items())
+        return all(key in values and values[key] in wanted for key, wanted in self.when.items())
 
     def draw(self, trial: Trial) -> Any:
-        """A value of Optuna's choosing."""
+        """A value that Optuna suggests, as the config has it."""
         if self.choices is not None:
             return self.choices[trial.suggest_categorical(self.key, list(self.choices))]
         if self.kind == "int":
@@ -78,7 +85,7 @@ class Parameter:
         """Every value, as Optuna stores it.
 
         Raises:
-            ConfigError: there are infinitely many, or their number is not meant.
+            ConfigError: there are infinitely many.
         """
         if self.choices is not None:
             return list(self.choices)
@@ -89,12 +96,12 @@ class Parameter:
         return [int(value) if self.kind == "int" else self.value(float(value)) for value in values]
 
     def value(self, label: Scalar) -> Any:
-        """What a stored label stands for in the config."""
+        """The config's value of a label that Optuna stores."""
         if self.choices is not None:
             return self.choices[label]
         if self.step is None or not isinstance(label, float):
             return label
-        return min(float(f"{label:.12g}"), self.high)  # three steps of 0.1 are 0.3 to a reader, and not beyond 0.3
+        return min(float(f"{label:.12g}"), self.high)  # 0.1 + 0.1 + 0.1 is a little more than 0.3
 
     def example(self) -> list[Any]:
         """Values to try against the config: all choices, or both ends."""
@@ -102,16 +109,15 @@ class Parameter:
             return list(self.choices.values())
         return [int(end) if self.kind == "int" else end for end in (self.low, self.high)]
 
-    def describe(self) -> dict[str, Any]:
-        """Plain and comparable: studies are continued with the same space alone."""
+    def describe(self) -> Config:
+        """The parameter as JSON has it; a study is only continued with the same space."""
+        content: Config = {"low": self.low, "high": self.high, "step": self.step, "log": self.log}
         if self.choices is not None:
-            told: dict[str, Any] = {"type": self.kind, "choices": list(self.choices)}
-        else:
-            told = {"type": self.kind, "low": self.low, "high": self.high, "step": self.step, "log": self.log}
-        return told | {"when": {key: list(values) for key, values in (self.when or {}).items()}}
+            content = {"choices": list(self.choices)}
+        return {"type": self.kind, **content, "when": {key: list(values) for key, values in self.when.items()}}
 
 
-def parse_space(space: Any) -> list[Parameter]:
+def parse_space(space: object) -> list[Parameter]:
     """Read the `space` of a sweep file, each parameter after those that its `when` names.
 
     Raises:
@@ -121,36 +127,38 @@ def parse_space(space: Any) -> list[Parameter]:
         raise ConfigError(
             "space is empty; name a setting to search, such as model.units: {type: int, low: 8, high: 64}"
         )
-    parameters = {}
-    for name, entry in space.items():
-        key = str(name).replace(".init_args.", ".")
-        parameters[key] = _parse(key, entry)
-    return _ordered(parameters)
+    return _sort_by_when({normalize_key(key): _parse_parameter(normalize_key(key), space[key]) for key in space})
 
 
-def _parse(key: str, entry: Any) -> Parameter:
+def normalize_key(key: object) -> str:
+    """A setting's dotted name without `init_args`."""
+    return str(key).replace(".init_args.", ".")
+
+
+def _parse_parameter(key: str, entry: object) -> Parameter:
     if isinstance(entry, list):
         entry = {"choices": entry}
     if not isinstance(entry, Mapping):
         raise ConfigError(f"space.{key} is {entry!r}; give a list of choices, or {{type: int, low: 1, high: 9}}")
-    for field in entry:
-        if field not in FIELDS:
-            raise ConfigError(f"space.{key} has no field {field!r}; {nearest(str(field), sorted(FIELDS))}")
+    for name in entry:
+        if name not in FIELDS:
+            raise ConfigError(f"space.{key} has no field {name!r}; {suggest_name(str(name), sorted(FIELDS))}")
     kind = entry.get("type", "categorical" if "choices" in entry else None)
     if kind not in KINDS:
-        raise ConfigError(f"space.{key} has type {kind!r}; {nearest(str(kind), KINDS)}")
+        raise ConfigError(f"space.{key} has type {kind!r}; {suggest_name(str(kind), KINDS)}")
     when = _parse_when(key, entry.get("when"))
     if kind == "categorical":
         choices = entry.get("choices")
         if not isinstance(choices, list) or not choices:
             raise ConfigError(f"space.{key} is categorical with choices {choices!r}; give a list")
-        return Parameter(key, kind, choices={_label(choice): choice for choice in choices}, when=when)
+        labels = [json.dumps(choice) if isinstance(choice, list | dict) else choice for choice in choices]
+        return Parameter(key, kind, choices=dict(zip(labels, choices, strict=True)), when=when)
     return _parse_range(key, kind, entry, when)
 
 
-def _parse_range(key: str, kind: str, entry: Mapping[str, Any], when: Mapping[str, tuple[Any, ...]]) -> Parameter:
+def _parse_range(key: str, kind: str, entry: Settings, when: Mapping[str, tuple[Any, ...]]) -> Parameter:
     whole = int if kind == "int" else (int, float)
-    numbers = {name: _number(entry.get(name)) for name in ("low", "high", "step")}
+    numbers = {name: _read_number(entry.get(name)) for name in ("low", "high", "step")}
     for name, number in numbers.items():
         if name == "step" and number is None:
             continue
@@ -167,23 +175,20 @@ def _parse_range(key: str, kind: str, entry: Mapping[str, Any], when: Mapping[st
     return Parameter(key, kind, as_kind(low), as_kind(high), None if step is None else as_kind(step), log, when=when)
 
 
-def _number(value: Any) -> Any:
-    """YAML 1.1 reads 1e-4 as text."""
+def _read_number(value: Any) -> Any:
+    """A number, also where YAML 1.1 reads it as text, as 1e-4; anything else as it is."""
     try:
         return float(value) if isinstance(value, str) else value
     except ValueError:
         return value
 
 
-def _parse_when(key: str, when: Any) -> dict[str, tuple[Any, ...]]:
+def _parse_when(key: str, when: object) -> dict[str, tuple[Any, ...]]:
     if when is None:
         return {}
     if not isinstance(when, Mapping):
         raise ConfigError(f"space.{key} has when {when!r}; give the parameter and its value, as {{model.cell: lstm}}")
-    return {
-        str(name).replace(".init_args.", "."): tuple(wanted) if isinstance(wanted, list) else (wanted,)
-        for name, wanted in when.items()
-    }
+    return {normalize_key(k): tuple(wanted) if isinstance(wanted, list) else (wanted,) for k, wanted in when.items()}
 
 
 def check_when(space: Sequence[Parameter]) -> None:
@@ -194,24 +199,23 @@ def check_when(space: Sequence[Parameter]) -> None:
     """
     choices = {parameter.key: list(parameter.choices.values()) for parameter in space if parameter.choices}
     for parameter in space:
-        for key, wanted in (parameter.when or {}).items():
+        for key, wanted in parameter.when.items():
             for value in wanted:
                 if key in choices and value not in choices[key]:
                     raise ConfigError(
-                        f"space.{parameter.key} has when {key} is {value!r}; {nearest(str(value), choices[key])}"
+                        f"space.{parameter.key} has when {key} is {value!r}; {suggest_name(str(value), choices[key])}"
                     )
 
 
-def _label(choice: Any) -> Scalar:
-    return choice if choice is None or isinstance(choice, str | int | float | bool) else json.dumps(choice)
-
-
-def _ordered(parameters: dict[str, Parameter]) -> list[Parameter]:
+def _sort_by_when(parameters: dict[str, Parameter]) -> list[Parameter]:
+    """Each parameter after those that its `when` names, otherwise in the order of the file."""
     for name, parameter in parameters.items():
-        when = dict(parameter.when or {})
+        when = dict(parameter.when)
         for key, wanted in when.items():
             if key not in parameters:
-                raise ConfigError(f"space.{name} has when {key}, which is not searched; {nearest(key, parameters)}")
+                raise ConfigError(
+                    f"space.{name} has when {key}, which is not searched; {suggest_name(key, parameters)}"
+                )
             if list(wanted) in (parameters[key].choices or {}).values():
                 when[key] = (list(wanted),)  # one choice that is a list, and not several
         parameters[name] = replace(parameter, when=when)
@@ -219,41 +223,40 @@ def _ordered(parameters: dict[str, Parameter]) -> list[Parameter]:
     left = list(parameters.values())
     while left:
         known = {parameter.key for parameter in ordered}
-        ready = [parameter for parameter in left if known.issuperset(parameter.when or ())]
-        if not ready:
+        ready = next((parameter for parameter in left if known.issuperset(parameter.when)), None)
+        if ready is None:
             raise ConfigError(f"space.{left[0].key} waits for itself through its when; break the circle")
-        # One at a time keeps the order of the file.
-        ordered.append(ready[0])
-        left.remove(ready[0])
+        ordered.append(ready)
+        left.remove(ready)
     return ordered
 
 
-def by_class_path(space: Sequence[Parameter], known: Container[str]) -> list[Parameter]:
-    """The space with classes by the name of their `class_path`, as `data.extractor.class_path` for `data.extractor`."""
+def name_classes(space: Sequence[Parameter], known: Container[str]) -> list[Parameter]:
+    """The space with classes renamed to their `class_path`, as `data.extractor.class_path` for `data.extractor`."""
     names = {
         parameter.key: f"{parameter.key}.class_path"
         for parameter in space
         if f"{parameter.key}.class_path" in known and all(isinstance(value, str) for value in parameter.example())
     }
     return [
-        replace(p, key=names.get(p.key, p.key), when={names.get(k, k): wanted for k, wanted in (p.when or {}).items()})
+        replace(p, key=names.get(p.key, p.key), when={names.get(k, k): wanted for k, wanted in p.when.items()})
         for p in space
     ]
 
 
-def draw(trial: Trial, space: Sequence[Parameter]) -> dict[str, Any]:
+def draw_values(trial: Trial, space: Sequence[Parameter]) -> Config:
     """The values of one trial by key; parameters whose `when` does not hold are left out."""
-    values: dict[str, Any] = {}
+    values: Config = {}
     for parameter in space:
         if parameter.active(values):
             values[parameter.key] = parameter.draw(trial)
     return values
 
 
-def grid(space: Sequence[Parameter], seed: int = 0) -> list[dict[str, Scalar]]:
+def list_grid(space: Sequence[Parameter], seed: int = 0) -> list[dict[str, Scalar]]:
     """Every combination once, in a shuffled order, so that the first few are spread over the space.
 
-    Combinations that differ only in a parameter that is not searched there are one.
+    Combinations that differ only in a parameter whose `when` does not hold are one.
 
     Returns:
         Optuna's labels by key.
@@ -261,41 +264,38 @@ def grid(space: Sequence[Parameter], seed: int = 0) -> list[dict[str, Scalar]]:
     Raises:
         ConfigError: a parameter has no step, or there are more combinations than anyone runs.
     """
-    size = math.prod(len(parameter.grid_labels()) for parameter in space)
+    labels = [parameter.grid_labels() for parameter in space]
+    size = math.prod(map(len, labels))
     if size > LARGEST_GRID:
         raise ConfigError(f"the grid has {size} combinations; take larger steps, or another sampler than grid")
-    cells = {json.dumps(cell): cell for cell in _cells(space)}
-    return [cells[name] for name in np.random.default_rng(seed).permutation(sorted(cells)).tolist()]
-
-
-def _cells(space: Sequence[Parameter]) -> Iterator[dict[str, Scalar]]:
-    for labels in itertools.product(*(parameter.grid_labels() for parameter in space)):
-        cell: dict[str, Scalar] = {}
-        values: dict[str, Any] = {}
-        for parameter, label in zip(space, labels, strict=True):
+    points = {}
+    for combination in itertools.product(*labels):
+        point: dict[str, Scalar] = {}
+        values: Config = {}
+        for parameter, label in zip(space, combination, strict=True):
             if parameter.active(values):
-                cell[parameter.key], values[parameter.key] = label, parameter.value(label)
-        yield cell
+                point[parameter.key], values[parameter.key] = label, parameter.value(label)
+        points[json.dumps(point)] = point
+    return [points[name] for name in np.random.default_rng(seed).permutation(sorted(points)).tolist()]
 
 
-def nearest(name: str, known: Iterable[Any]) -> str:
-    """The remedy for a mistyped name."""
-    known = list(map(str, known))
-    near = get_close_matches(name, known, n=1, cutoff=0.5)
+def suggest_name(name: str, known: Iterable[object]) -> str:
+    """The remedy for a mistyped name: the nearest known one, or all of them."""
+    names = list(map(str, known))
+    near = get_close_matches(name, names, n=1, cutoff=0.5)
     if not near:  # a dotted name may be right in its last part alone
-        last = name.rpartition(".")[2]
-        near = [key for key in known if key.rpartition(".")[2] == last][:1]
+        near = [key for key in names if key.rpartition(".")[2] == name.rpartition(".")[2]]
     if near:
         return f"did you mean {near[0]}?"
-    return f"choose one of {', '.join(known)}" if len(known) <= 20 else "see `python -m lightning_pose fit --help`"
+    return f"choose one of {', '.join(names)}" if len(names) <= 20 else "see `python -m lightning_pose fit --help`"
 
 
 BASE, SEED, SCENE = "base", "seed_everything", "data.root"
-"""Parameters with a part of their own: which base config a trial has, what is averaged over, and a folder."""
+"""Parameters with a special meaning: which base config a trial has, the seed, and the folder of the scene."""
 
 MEASURES = {
     None: ("val/", "cost/"),
     "test": ("val/", "test/", "cost/", "baseline/", "train/"),
     "features": ("features/",),
 }
-"""What trials measure, and the metrics that they have then."""
+"""Prefixes of the metrics that trials have, by the `measure` of the sweep file."""

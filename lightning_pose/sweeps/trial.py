@@ -1,4 +1,4 @@
-"""One trial: a run of `fit` that reports every epoch, can be cut short, and never sees the test frames."""
+"""One trial: a run of `fit` that reports every epoch, can be pruned, and chooses nothing by test frames."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ from lightning_pose.runs.process import process_tags
 from lightning_pose.runs.tags import CURVES, METRICS, PARENT_TAG, REASON, RUN
 from lightning_pose.sweeps.base_config import ParsedConfig, open_keypoint_data
 from lightning_pose.sweeps.plan import Plan
-from lightning_pose.sweeps.space import draw
+from lightning_pose.sweeps.space import Settings, draw_values
 
-__all__ = ["run_trial"]
+__all__ = ["EpochWatch", "TrialCLI", "run_trial"]
 
 
 class EpochWatch(Callback):
@@ -42,9 +42,9 @@ class EpochWatch(Callback):
         trial: what reports go to.
 
     Attributes:
-        monitor: the metric whose lowest value says which epoch's weights `fit` keeps.
+        monitor: the metric whose lowest value decides which epoch's weights `fit` keeps.
         epochs: the metrics of each.
-        pruned: why it was cut short, None where it was not.
+        pruned: why it was pruned, None where it was not.
     """
 
     def __init__(self, plan: Plan, trial: Trial) -> None:
@@ -65,13 +65,13 @@ class EpochWatch(Callback):
         if len(self.objectives) > 1 or not math.isfinite(measured.get(first, math.nan)):
             return
         self.trial.report(measured[first], trainer.current_epoch)
-        last = trainer.current_epoch + 1 == trainer.max_epochs  # nothing is saved by giving that one up
+        last = trainer.current_epoch + 1 == trainer.max_epochs  # pruning the last epoch would save nothing
         if not last and self.trial.should_prune():
             self.pruned = f"pruned after epoch {trainer.current_epoch + 1} with {first} {measured[first]:.4g}"
             trainer.should_stop = True
 
     def values(self) -> dict[str, float]:
-        """The metrics of the epoch whose weights `fit` would keep, so that it finds again what the sweep has found.
+        """The metrics of the epoch whose weights `fit` would keep, so that `fit` reproduces the trial's value.
 
         Raises:
             ConfigError: no validation frames, or no epoch ended in a number.
@@ -88,8 +88,8 @@ class EpochWatch(Callback):
         return min(finite, key=lambda epoch: epoch[self.monitor])
 
 
-class _TrialCLI(PoseCLI):
-    """`fit` without its own bar, and without checkpoints and the test that follows it, unless the study measures that.
+class TrialCLI(PoseCLI):
+    """`fit` without a progress bar and checkpoints, and without its test unless the study measures test frames.
 
     Attributes:
         measured: metrics beside those of validation frames.
@@ -104,17 +104,18 @@ class _TrialCLI(PoseCLI):
         try:
             super().__init__(["fit", *args])
         finally:
-            if plan.measure == "test" and hasattr(self, "trainer"):  # which keeps the best epoch until it is tested
+            if plan.measure == "test" and hasattr(self, "trainer"):  # its best epoch was kept for the test
                 shutil.rmtree(checkpoint_folder(self.trainer), ignore_errors=True)
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
         trainer = super().instantiate_trainer(**kwargs)
         self.recorder.keeps_checkpoints = False
-        best = next(c for c in trainer.callbacks if isinstance(c, BestCheckpoint))  # type: ignore[attr-defined]
+        best = next(c for c in trainer.checkpoint_callbacks if isinstance(c, BestCheckpoint))
         self.watch.monitor = best.monitor or self.watch.monitor
         wanted = BestCheckpoint if self.plan.measure == "test" else ()
-        kept = [c for c in trainer.callbacks if not isinstance(c, ModelCheckpoint) or isinstance(c, wanted)]  # type: ignore[attr-defined]
-        trainer.callbacks = [*kept, self.watch]  # type: ignore[attr-defined]
+        callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]  # which Lightning does not declare
+        callbacks[:] = [c for c in callbacks if not isinstance(c, ModelCheckpoint) or isinstance(c, wanted)]
+        callbacks.append(self.watch)
         if trainer.progress_bar_callback is not None:
             trainer.progress_bar_callback.disable()
         return trainer
@@ -123,15 +124,15 @@ class _TrialCLI(PoseCLI):
         if self.watch.pruned is not None:
             return
         if self.plan.measure == "test":
-            self._test()
+            self._measure_test()
         else:  # test frames must not choose
-            self._cost()
+            self._measure_costs()
 
-    def _test(self) -> None:
-        """Measure the best epoch on the test frames; for the study's figure alone."""
-        report = next(c for c in self.trainer.callbacks if isinstance(c, TestReport))  # type: ignore[attr-defined]
+    def _measure_test(self) -> None:
+        """Measure the best epoch on the test frames, only for the study's figure and table."""
+        report: TestReport = self.config_init["fit"].report
         report.log_model = False
-        with contextlib.redirect_stdout(io.StringIO()):  # one table a trial would bury the study's
+        with contextlib.redirect_stdout(io.StringIO()):  # without the table of each trial
             super().after_fit()
         found = report.evaluation
         assert found is not None, "a test ends in an evaluation"
@@ -141,8 +142,8 @@ class _TrialCLI(PoseCLI):
             self.measured |= {f"baseline/{system}/{name}": value for name, value in metrics.items()}
         self.curves = found.curves
 
-    def _cost(self) -> None:
-        """What the model costs, as far as it is known without test frames."""
+    def _measure_costs(self) -> None:
+        """Measure the model's costs without test frames."""
         split = "val" if len(self.datamodule.scene.splits["val"]) else "train"
         frames = self.datamodule.clip_length if self.model.reads_clips else 1
         extracts = any(objective.metric == "cost/features_ms_per_frame" for objective in self.plan.objectives)
@@ -152,7 +153,7 @@ class _TrialCLI(PoseCLI):
             logger.log_metrics(self.measured)
 
 
-def run_trial(trial: Trial, plan: Plan, parent: str) -> float | list[float]:
+def run_trial(trial: Trial, plan: Plan, parent: str) -> list[float]:
     """Train once with the trial's values, as a nested MLflow run.
 
     Args:
@@ -166,110 +167,110 @@ def run_trial(trial: Trial, plan: Plan, parent: str) -> float | list[float]:
     Raises:
         optuna.TrialPruned: the pruner stopped it.
         KeyboardInterrupt: the user did.
-        Exception: whatever broke it; Optuna and MLflow know why.
+        Exception: what went wrong in it, which is recorded in Optuna and MLflow first.
     """
-    client = MlflowClient(plan.tracking[0])
-    run = None
+    record = _TrialRecord(trial, plan)
     try:
-        run = _create_run(trial, plan, parent, client)
-        values = draw(trial, plan.space)
+        run = record.create_run(parent)
+        values = draw_values(trial, plan.space)
         for key, value in values.items():
-            client.set_tag(run, f"sweep.{key}", str(value))
+            record.client.set_tag(run, f"sweep.{key}", str(value))
         if plan.measure == "features":
-            return _features(trial, plan, values, client, run)
-        return _fit(trial, plan, [*plan.arguments(values), f"--trainer.logger.run_id={run}"], client, run)
+            return _measure_features(record, run, values)
+        watch = EpochWatch(plan, trial)
+        with shared_factors():
+            cli = TrialCLI([*plan.arguments(values), f"--trainer.logger.run_id={run}"], watch, plan)
+        if watch.pruned is not None:
+            raise optuna.TrialPruned(watch.pruned)
+        return record.keep_values(watch.values() | cli.measured, cli.curves)
     except optuna.TrialPruned as pruned:
-        _end(trial, client, run, "PRUNED", "KILLED", str(pruned))
+        record.keep_reason("PRUNED", "KILLED", str(pruned))
         raise
     except (KeyboardInterrupt, SystemExit) as stop:  # Lightning turns Ctrl-C and SIGTERM into SystemExit
-        _end(trial, client, run, "INTERRUPTED", "KILLED", "interrupted")
+        record.keep_reason("INTERRUPTED", "KILLED", "interrupted")
         raise KeyboardInterrupt from stop
     except Exception as error:
         reason = str(error) if isinstance(error, PoseError) else f"{type(error).__name__}: {error}"
-        _end(trial, client, run, "FAILED", "FAILED", reason, traceback.format_exc())
+        record.keep_reason("FAILED", "FAILED", reason, traceback.format_exc())
         raise
 
 
-def _create_run(trial: Trial, plan: Plan, parent: str, client: MlflowClient) -> str:
-    known = client.get_experiment_by_name(plan.tracking[1])
-    assert known is not None, "the study's run is in it"
-    study = trial.study.study_name
-    tags = {PARENT_TAG: parent, "sweep.study": study, "sweep.trial": str(trial.number), **process_tags()}
-    name = f"{study} trial {trial.number}"  # until its settings are known
-    run = client.create_run(known.experiment_id, run_name=name, tags=tags).info.run_id
-    trial.set_user_attr(RUN, run)
-    with contextlib.suppress(MlflowException):  # the user may have deleted it, which is no reason to train nothing
-        # A command that ended between two trials of this one has closed it.
-        client.update_run(parent, status="RUNNING")
-    return run
-
-
-def _fit(trial: Trial, plan: Plan, args: list[str], client: MlflowClient, run: str) -> float | list[float]:
-    watch = EpochWatch(plan, trial)
-    with shared_factors():
-        cli = _TrialCLI(args, watch, plan)
-    if watch.pruned is not None:
-        raise optuna.TrialPruned(watch.pruned)
-    return _keep(trial, plan, watch.values() | cli.measured, cli.curves, client, run)
-
-
-def _features(
-    trial: Trial, plan: Plan, values: Mapping[str, Any], client: MlflowClient, run: str
-) -> float | list[float]:
-    data, images = open_keypoint_data(ParsedConfig(plan.arguments(values)))
+def _measure_features(record: _TrialRecord, run: str, values: Settings) -> list[float]:
+    """Measure keypoints instead of training."""
+    data, images = open_keypoint_data(ParsedConfig(record.plan.arguments(values)))
     metrics, curves = measure_keypoints(data.cache, images, data.extractor.n_features)
-    for name, value in metrics.items():
-        client.log_metric(run, name, value)
-    for name, curve in curves.items():
+    for name, curve in (*((name, {0: value}) for name, value in metrics.items()), *curves.items()):
         for number, value in curve.items():
-            client.log_metric(run, name, value, step=number)
-    client.set_terminated(run, "FINISHED")
-    return _keep(trial, plan, metrics, curves, client, run)
+            record.client.log_metric(run, name, value, step=number)
+    record.client.set_terminated(run, "FINISHED")
+    return record.keep_values(metrics, curves)
 
 
-def _keep(
-    trial: Trial,
-    plan: Plan,
-    found: Mapping[str, float],
-    curves: Mapping[str, Mapping[int, float]],
-    client: MlflowClient,
-    run: str,
-) -> float | list[float]:
-    """Keep what a trial measured where the study's table and figure find it, and hand out the objectives' values.
+class _TrialRecord:
+    """What Optuna and MLflow keep of a trial.
 
-    Raises:
-        ConfigError: one of the values is no finite number.
+    Args:
+        trial: Optuna's.
+        plan: of the sweep.
+
+    Attributes:
+        client: of the store that has the trial's MLflow run.
+        run: id of this run; None before it is created.
     """
-    values = [found[objective.metric] for objective in plan.objectives]
-    for objective, value in zip(plan.objectives, values, strict=True):
-        if not math.isfinite(value):  # Optuna would fail the trial too, without a word
-            raise ConfigError(
-                f"{objective.metric} came out as {value}; lower the learning rate, or leave it out of the objectives"
-            )
-    trial.set_user_attr(METRICS, {name: value for name, value in found.items() if math.isfinite(value)})
-    if curves:
-        trial.set_user_attr(CURVES, {name: list(map(list, curve.items())) for name, curve in curves.items()})
-    for objective, value in zip(plan.objectives, values, strict=True):
-        client.log_metric(run, f"objective/{objective.metric}", value)
-    client.set_tag(run, "sweep.state", "COMPLETE")
-    return values if len(values) > 1 else values[0]
 
+    def __init__(self, trial: Trial, plan: Plan) -> None:
+        self.trial, self.plan = trial, plan
+        self.client = MlflowClient(plan.tracking[0])
+        self.run: str | None = None
 
-def _end(
-    trial: Trial, client: MlflowClient, run: str | None, state: str, status: str, reason: str, error: str | None = None
-) -> None:
-    """Write down why a trial has no value, where Optuna and where MLflow look.
+    def create_run(self, parent: str) -> str:
+        """Create the trial's MLflow run in that of the study; returns its id."""
+        experiment = self.client.get_experiment_by_name(self.plan.tracking[1])
+        assert experiment is not None, "the study's run is in it"
+        study, number = self.trial.study.study_name, self.trial.number
+        tags = {PARENT_TAG: parent, "sweep.study": study, "sweep.trial": str(number), **process_tags()}
+        name = f"{study} trial {number}"  # until its settings are known
+        self.run = self.client.create_run(experiment.experiment_id, run_name=name, tags=tags).info.run_id
+        self.trial.set_user_attr(RUN, self.run)
+        with contextlib.suppress(MlflowException):  # if the user has deleted it, the trial runs all the same
+            # A command that ended between two trials of this one has closed it.
+            self.client.update_run(parent, status="RUNNING")
+        return self.run
 
-    Nothing that goes wrong in here may hide what ended the trial, least of all a Ctrl-C.
-    """
-    shown = " ".join(reason.split())[:500]
-    with contextlib.suppress(OptunaError):  # a trial that was taken for dead has its reason; the database may be gone
-        trial.set_user_attr(REASON, shown)
-    if run is None:
-        return
-    with contextlib.suppress(MlflowException, OSError):
-        client.set_tag(run, "sweep.state", state)
-        client.set_tag(run, "sweep.reason", shown)
-        client.set_terminated(run, status)
-        if error is not None:
-            client.log_text(run, error, "error.txt")
+    def keep_values(self, found: Mapping[str, float], curves: Mapping[str, Mapping[int, float]]) -> list[float]:
+        """Keep what a trial measured, for the study's table and figure; returns the objectives' values.
+
+        Raises:
+            ConfigError: one of the values is no finite number.
+        """
+        values = {objective.metric: found[objective.metric] for objective in self.plan.objectives}
+        for metric, value in values.items():
+            if not math.isfinite(value):  # Optuna would fail the trial too, but without a reason
+                raise ConfigError(
+                    f"{metric} came out as {value}; lower the learning rate, or leave it out of the objectives"
+                )
+        self.trial.set_user_attr(METRICS, {name: value for name, value in found.items() if math.isfinite(value)})
+        if curves:
+            self.trial.set_user_attr(CURVES, {name: list(map(list, curve.items())) for name, curve in curves.items()})
+        for metric, value in values.items():
+            self.client.log_metric(str(self.run), f"objective/{metric}", value)
+        self.client.set_tag(str(self.run), "sweep.state", "COMPLETE")
+        return list(values.values())
+
+    def keep_reason(self, state: str, status: str, reason: str, error: str | None = None) -> None:
+        """Keep why a trial has no value.
+
+        A store that fails here must not hide what ended the trial, least of all a Ctrl-C.
+        """
+        shown = " ".join(reason.split())[:500]
+        # Refused where another process has already failed the trial with a reason of its own.
+        with contextlib.suppress(OptunaError):
+            self.trial.set_user_attr(REASON, shown)
+        if self.run is None:
+            return
+        with contextlib.suppress(MlflowException, OSError):
+            self.client.set_tag(self.run, "sweep.state", state)
+            self.client.set_tag(self.run, "sweep.reason", shown)
+            self.client.set_terminated(self.run, status)
+            if error is not None:
+                self.client.log_text(self.run, error, "error.txt")

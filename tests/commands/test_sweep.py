@@ -1,4 +1,4 @@
-"""The verb sweep on a tiny scene: studies, their runs, how they go on, and what they leave."""
+"""The verb sweep on a tiny scene: studies, their runs, their results, and how they are continued."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mlflow.entities import Run
 from optuna.trial import TrialState
 
 from lightning_pose.sweeps.plan import read_plan
-from lightning_pose.sweeps.storage import shown
+from lightning_pose.sweeps.storage import hide_password
 from lightning_pose.sweeps.trial import EpochWatch
 from tests.helpers import REPOSITORY, Workplace
 
@@ -88,7 +88,7 @@ def test_a_class_can_be_searched_with_its_own_settings(sweep_file: Sweep) -> Non
 
 
 def test_a_password_is_not_shown() -> None:
-    assert shown("postgresql://ada:secret@host/db") == "postgresql://ada:***@host/db"
+    assert hide_password("postgresql://ada:secret@host/db") == "postgresql://ada:***@host/db"
 
 
 def test_every_architecture_has_a_sweep_file() -> None:
@@ -139,7 +139,7 @@ def test_a_sweep_leaves_runs_and_a_config_that_trains_and_goes_on(
 
     assert workplace.command(*command) == 0
     assert [trial.state for trial in trials(workplace)] == [TrialState.COMPLETE] * 4
-    assert len({trial.params["model.units"] for trial in trials(workplace)}) > 2, "the sampler starts over"
+    assert len({trial.params["model.units"] for trial in trials(workplace)}) > 2, "the sampler draws the same again"
     again, children = parent_and_children(workplace)
     assert (again.info.run_id, again.info.status, len(children)) == (parent.info.run_id, "FINISHED", 4)
 
@@ -150,7 +150,7 @@ def test_a_sweep_leaves_runs_and_a_config_that_trains_and_goes_on(
     assert fitted.data.metrics["val/position_median_m"] == pytest.approx(best.value or 0, rel=1e-4)
 
 
-def test_a_trial_is_worth_what_fit_would_keep_of_it(workplace: Workplace, sweep_file: Sweep) -> None:
+def test_a_trial_has_the_value_of_the_epoch_that_fit_keeps(workplace: Workplace, sweep_file: Sweep) -> None:
     settings = {"trainer.max_epochs": 6, "model.learning_rate": 0.3, "best.monitor": "val/orientation_median_deg"}
     file = sweep_file(objective="val/position_median_m", pruner="none", settings=settings)
     assert workplace.command("sweep", file, "--n_trials", "1") == 0
@@ -162,7 +162,7 @@ def test_a_trial_is_worth_what_fit_would_keep_of_it(workplace: Workplace, sweep_
     assert trial.value == pytest.approx(fitted.data.metrics["best/val/position_median_m"], rel=1e-4)
 
 
-def test_the_epoch_that_fit_keeps_counts_and_not_the_best_of_the_objective(sweep_file: Sweep) -> None:
+def test_the_epoch_is_chosen_by_the_monitor_and_not_by_the_objective(sweep_file: Sweep) -> None:
     plan = read_plan(sweep_file(objective="val/position_median_m"), {})
     watch = EpochWatch(plan, optuna.trial.create_trial(value=0.0))  # type: ignore[arg-type]
     watch.epochs = [
@@ -210,7 +210,7 @@ def test_a_hopeless_trial_is_pruned(workplace: Workplace, sweep_file: Sweep) -> 
     assert "after epoch 1" in run.data.tags["sweep.reason"]
 
 
-def test_two_objectives_have_a_front(workplace: Workplace, sweep_file: Sweep) -> None:
+def test_two_objectives_have_a_pareto_front(workplace: Workplace, sweep_file: Sweep) -> None:
     file = sweep_file(objective=["val/position_median_m", "cost/parameters"], sampler="nsga2")
     assert workplace.command("sweep", file, "--n_trials", "2", "--out", workplace.folder / "out") == 0
     by_units = sorted(trials(workplace), key=lambda trial: trial.params["model.units"])
@@ -220,17 +220,17 @@ def test_two_objectives_have_a_front(workplace: Workplace, sweep_file: Sweep) ->
     assert (workplace.folder / "out" / "best.yaml").is_file()
 
 
-def test_workers_share_a_study_and_one_may_die(
-    workplace: Workplace, sweep_file: Sweep, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Exactly the cells of the grid, each once, although a worker is killed in the middle of a trial."""
+def test_workers_share_a_study_and_one_is_killed(workplace: Workplace, sweep_file: Sweep) -> None:
+    """Exactly the points of the grid, each once, although a worker is killed in the middle of a trial."""
     killer = {"class_path": "tests.helpers.KillOnce", "init_args": {"marker": str(workplace.folder / "killed")}}
     settings = {"trainer.max_epochs": 2, "trainer.callbacks": [killer]}
     file = sweep_file(sampler="grid", space={"model.units": [4, 5, 6]}, settings=settings, pruner="none")
-    assert workplace.command("sweep", file, "--workers", "2") == 0
-    told = capsys.readouterr().err
-    assert "trial 3/3" in told
-    assert re.search(r"^the process of trial \d died; it is run again as trial 3$", told, re.MULTILINE)
+    # In a process of its own: workers keep the environment of the first sweep in a process.
+    with workplace.start("sweep", file, "--workers", "2") as command:
+        _, errors = command.communicate(timeout=200)
+    assert command.returncode == 0, errors
+    assert "trial 3/3" in errors
+    assert re.search(r"^the process of trial \d died; it is run again as trial 3$", errors, re.MULTILINE)
     complete = [trial for trial in trials(workplace) if trial.state == TrialState.COMPLETE]
     (dead,) = (trial for trial in trials(workplace) if trial.state != TrialState.COMPLETE)
     assert sorted(trial.params["model.units"] for trial in complete) == [4, 5, 6]

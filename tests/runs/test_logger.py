@@ -16,7 +16,7 @@ import pytest
 from lightning_pose.errors import CheckpointError
 from lightning_pose.paths import default_tracking_uri
 from lightning_pose.runs.logger import REQUIREMENTS, MLflowLogger, find_last_run, flatten_settings
-from lightning_pose.runs.process import has_died, machine, process_name
+from lightning_pose.runs.process import has_died, identify_machine, process_name
 from tests.helpers import Trained, Workplace
 
 DISTRIBUTIONS = {"cv2": "opencv-contrib-python-headless", "yaml": "PyYAML", "sklearn": "scikit-learn"}
@@ -98,18 +98,18 @@ def test_runs_whose_process_is_gone_are_closed(
 
 def test_a_machine_is_more_than_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
     """Another boot, or another machine of the same name, has processes of its own under the same numbers."""
-    dead = f"{machine()}:{dead_process()}"
+    dead = f"{identify_machine()}:{dead_process()}"
     assert has_died(dead)
     assert not has_died(process_name())
-    assert machine().split()[0] == socket.gethostname()
+    assert identify_machine().split()[0] == socket.gethostname()
     monkeypatch.setattr(Path, "read_text", lambda self: "another boot")
-    machine.cache_clear()
+    identify_machine.cache_clear()
     try:
-        assert machine().split()[0] == socket.gethostname()
+        assert identify_machine().split()[0] == socket.gethostname()
         assert not has_died(dead)
     finally:
         monkeypatch.undo()
-        machine.cache_clear()
+        identify_machine.cache_clear()
 
 
 @pytest.mark.parametrize(("began", "status"), [(1000, "KILLED"), (None, "RUNNING")])
@@ -134,7 +134,7 @@ def test_a_sweep_s_run_is_not_closed_while_its_trials_live(
     parent = str(logger.run_id)
     logger.client.set_tag(parent, "process.id", str(dead_process()))
     number = os.getppid() if trial == "alive" else dead_process()
-    host = "elsewhere" if trial == "of another machine" else machine()
+    host = "elsewhere" if trial == "of another machine" else identify_machine()
     tags = {"mlflow.parentRunId": parent, "process.host": host, "process.id": str(number)}
     logger.client.create_run(str(logger.experiment_id), tags=tags)
     following = MLflowLogger(tracking_uri=workplace.uri)

@@ -16,9 +16,10 @@ import yaml
 
 from lightning_pose.errors import ConfigError
 from lightning_pose.features.base import Record
-from lightning_pose.studies.figure import draw_cells
+from lightning_pose.studies.figure import draw_groups
 from lightning_pose.studies.figure_spec import FigureSpec, parse_figure_spec
-from lightning_pose.studies.table import Cell, as_markdown, named, varying
+from lightning_pose.studies.result import write_markdown
+from lightning_pose.studies.table import Group, build_rows, name_value, varying_settings
 from lightning_pose.sweeps.plan import Plan, read_plan
 from lightning_pose.sweeps.space import parse_space
 from tests.helpers import Thumbnails, Workplace
@@ -75,7 +76,7 @@ def test_a_study_of_two_systems_measures_the_test_frames(
     )
     assert workplace.command("sweep", file) == 0
     printed = capsys.readouterr().out
-    assert "retrieval_top1" not in printed, "a test's own table would bury the study's"
+    assert "retrieval_top1" not in printed, "the table of each test is not printed"
     found = rows(workplace)
     assert [(row["base"], row["model.units"]) for row in found] == [
         ("tiny", "4"), ("tiny", "8"), ("small", "4"), ("small", "4"), ("small", "8"), ("small", "8"),
@@ -105,7 +106,7 @@ def test_a_study_of_two_systems_measures_the_test_frames(
     assert "base" not in best
 
 
-def test_a_trial_that_fails_is_a_row_that_says_why(workplace: Workplace, study: Study) -> None:
+def test_a_failed_trial_is_a_row_with_its_reason(workplace: Workplace, study: Study) -> None:
     file = study(measure="test", space={"model.units": [0, 4]}, figure={"x": "model.units"})
     assert workplace.command("sweep", file) == 0
     failed, ended = rows(workplace)
@@ -200,7 +201,7 @@ def check_file(file: Path) -> None:
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_a_study_that_cannot_be_is_refused(entries: dict[str, Any], message: str, study: Study) -> None:
+def test_a_malformed_study_is_refused(entries: dict[str, Any], message: str, study: Study) -> None:
     with pytest.raises(ConfigError, match=message):
         check_file(study(**entries))
 
@@ -213,19 +214,19 @@ def figure_spec(x: str = "model.units", **entries: Any) -> FigureSpec:
 
 def test_names_of_values() -> None:
     values = ["lightning_pose.features.SURF", "/data/fr1.xyz", [8.0], [1, 2], None, True, 0.1, 30, "efficientnet_lite0"]
-    assert [named(value) for value in values] == [
+    assert [name_value(value) for value in values] == [
         "SURF", "fr1.xyz", "8", "[1, 2]", "none", "yes", "0.1", "30", "efficientnet_lite0",
     ]  # fmt: skip
 
 
 def test_a_table_has_means_and_their_range() -> None:
-    cells = [
-        Cell({"model.units": 1, "model.cell": "gru"}, [{TEST: 0.1}, {TEST: 0.3}]),
-        Cell({"model.units": 2, "model.cell": "gru"}, [{TEST: 12345.0}]),
-        Cell({"model.units": 3, "model.cell": "gru"}, reason="no | such"),
+    groups = [
+        Group({"model.units": 1, "model.cell": "gru"}, [{TEST: 0.1}, {TEST: 0.3}]),
+        Group({"model.units": 2, "model.cell": "gru"}, [{TEST: 12345.0}]),
+        Group({"model.units": 3, "model.cell": "gru"}, reason="no | such"),
     ]
-    assert varying(cells) == ["model.units"]
-    assert as_markdown(cells, figure_spec(y=TEST)).splitlines() == [
+    assert varying_settings(groups) == ["model.units"]
+    assert write_markdown(*build_rows(groups, figure_spec(y=TEST))).splitlines() == [
         "| units | trials | median position error (m) |",
         "| --- | --- | --- |",
         "| 1 | 2 | 0.2 (0.1 to 0.3) |",
@@ -236,19 +237,19 @@ def test_a_table_has_means_and_their_range() -> None:
 
 def test_a_figure_has_a_line_for_each_other_setting() -> None:
     beside = {TEST.replace("test/", "baseline/oracle/"): 0.05}
-    cells = [
-        Cell({"model.units": units, "model.cell": cell}, [{TEST: units * scale, **beside}])
+    groups = [
+        Group({"model.units": units, "model.cell": cell}, [{TEST: units * scale, **beside}])
         for cell, scale in (("gru", 0.1), ("rnn", 0.2))
         for units in (1, 2, 4)
     ]
-    (axes,) = draw_cells(cells, figure_spec(y=TEST, beside=["oracle"]), "title").axes
+    (axes,) = draw_groups(groups, figure_spec(y=TEST, beside=["oracle"]), "title").axes
     drawn = {line.get_label(): np.asarray(line.get_xydata()).tolist() for line in axes.get_lines()}
     assert drawn == {
         "gru": [[1, 0.1], [2, 0.2], [4, pytest.approx(0.4)]],
         "rnn": [[1, 0.2], [2, 0.4], [4, pytest.approx(0.8)]],
         "oracle": [[1, 0.05], [2, 0.05], [4, 0.05]],
     }
-    (axes,) = draw_cells(cells, figure_spec(y=TEST, kind="bar"), "title").axes
+    (axes,) = draw_groups(groups, figure_spec(y=TEST, kind="bar"), "title").axes
     heights = sorted(round(bar.get_height(), 6) for bar in axes.patches)  # type: ignore[attr-defined]
     assert heights == [0.1, 0.2, 0.2, 0.4, 0.4, 0.8]
     assert [text.get_text() for text in axes.get_xticklabels()] == ["1", "2", "4"]
@@ -256,8 +257,8 @@ def test_a_figure_has_a_line_for_each_other_setting() -> None:
 
 @pytest.mark.parametrize("kind", ["line", "bar"])
 def test_logarithmic_axes_hold_what_is_drawn(kind: str) -> None:
-    cells = [Cell({"model.units": units, "model.cell": "gru"}, [{TEST: units**2 / 100}]) for units in (1, 10, 100)]
-    (axes,) = draw_cells(cells, figure_spec(y=TEST, kind=kind, log=["x", "y"] if kind == "line" else ["y"]), "").axes
+    groups = [Group({"model.units": units, "model.cell": "gru"}, [{TEST: units**2 / 100}]) for units in (1, 10, 100)]
+    (axes,) = draw_groups(groups, figure_spec(y=TEST, kind=kind, log=["x", "y"] if kind == "line" else ["y"]), "").axes
     assert axes.get_yscale() == "log"
     low, high = axes.get_ylim()
     assert 0.005 < low < 0.01
@@ -267,6 +268,6 @@ def test_logarithmic_axes_hold_what_is_drawn(kind: str) -> None:
 
 
 def test_curves_are_averaged_over_seeds() -> None:
-    cell = Cell({}, [{}, {}], [{"c": {2: 1.0, 4: 3.0}}, {"c": {2: 2.0}}])
-    assert cell.curve("c") == {2: 1.5, 4: 3.0}
-    assert cell.curve("other") == {}
+    group = Group({}, [{}, {}], [{"c": {2: 1.0, 4: 3.0}}, {"c": {2: 2.0}}])
+    assert group.curve("c") == {2: 1.5, 4: 3.0}
+    assert group.curve("other") == {}

@@ -1,8 +1,9 @@
-"""What a sweep bears: Ctrl-C at any moment, processes that die or break, and an MLflow that fails."""
+"""Failures in a sweep: Ctrl-C at any moment, processes that are killed or break, and stores that fail."""
 
 from __future__ import annotations
 
-import multiprocessing
+import contextlib
+import os
 import signal
 import socket
 import subprocess
@@ -12,18 +13,20 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import optuna
+import psutil
 import pytest
 import yaml
+from lightning.pytorch.callbacks import Callback
 from mlflow import MlflowClient
 from mlflow.exceptions import MlflowException
 from optuna.exceptions import StorageInternalError
+from optuna.storages import RDBStorage
 from optuna.trial import FrozenTrial, TrialState
 
-from lightning_pose.runs.process import machine, process_name
+from lightning_pose.runs.process import identify_machine, process_name
 from lightning_pose.sweeps import trial, workers
-from lightning_pose.sweeps.outages import PatientStorage
 from lightning_pose.sweeps.plan import Plan, read_plan
-from lightning_pose.sweeps.study import open_storage, open_study, queue_again, recover
+from lightning_pose.sweeps.study import open_storage, open_study, queue_again, recover_trials
 from lightning_pose.sweeps.trial import EpochWatch, run_trial
 from tests.helpers import Workplace
 
@@ -44,12 +47,12 @@ def address(workplace: Workplace) -> str:
 
 
 @pytest.fixture
-def storage(workplace: Workplace) -> PatientStorage:
+def storage(workplace: Workplace) -> RDBStorage:
     return open_storage(address(workplace), workplace.uri)
 
 
 @pytest.fixture
-def study(storage: PatientStorage) -> optuna.Study:
+def study(storage: RDBStorage) -> optuna.Study:
     return optuna.create_study(storage=storage)
 
 
@@ -57,57 +60,61 @@ def states(study: optuna.Study) -> list[str]:
     return [trial.state.name for trial in study.get_trials(deepcopy=False)]
 
 
-def finish(orders: Any, file: Path) -> None:
-    """A worker whose trial takes a second longer than there are orders."""
-    with pytest.raises(EOFError):
-        orders.recv()
-    time.sleep(1)
-    file.touch()
+class ExitOnce(Callback):
+    """Ends one process, in the middle of an epoch, as an error outside the trial would; others end later.
+
+    Args:
+        marker: a file that exists once it has happened.
+    """
+
+    def __init__(self, marker: str) -> None:
+        self.marker = Path(marker)
+
+    def on_train_batch_end(self, *args: object, **kwargs: object) -> None:
+        with contextlib.suppress(FileExistsError):
+            self.marker.touch(exist_ok=False)
+            os._exit(1)
+        time.sleep(0.5)
 
 
-def test_trials_under_way_are_finished_when_a_worker_breaks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    file = tmp_path / "finished"
-
-    def break_off(*args: Any) -> NoReturn:
-        *_, crew = args
-        context = multiprocessing.get_context("spawn")
-        ours, theirs = context.Pipe()
-        process = context.Process(target=finish, args=(theirs, file))
-        process.start()
-        theirs.close()
-        crew.append(workers._Worker(process, ours, busy=True))
-        raise RuntimeError("a worker of the sweep broke")
-
-    monkeypatch.setattr(workers, "PATIENCE_SECONDS", 0)
-    monkeypatch.setattr(workers, "_give_orders", break_off)
-    with pytest.raises(RuntimeError, match="a worker of the sweep broke"):
-        workers.run_together(None, 2, lambda: None, 2)  # type: ignore[arg-type]
-    assert file.exists()
+def test_trials_under_way_are_finished_when_a_worker_breaks(workplace: Workplace) -> None:
+    breaker = {
+        "class_path": "tests.sweeps.test_failures.ExitOnce",
+        "init_args": {"marker": str(workplace.folder / "x")},
+    }
+    settings = {"trainer.callbacks": [breaker], "trainer.max_epochs": 1}
+    file = write(workplace, sampler="grid", space={"model.units": [4, 5, 6, 7]}, settings=settings)
+    with workplace.start("sweep", file, "--workers", "2") as command:
+        _, errors = command.communicate(timeout=200)
+    assert "RuntimeError: a worker of the sweep broke" in errors
+    assert "the sweep breaks off; trials under way are finished first" in errors
+    found = sorted(states(optuna.load_study(study_name=STUDY, storage=address(workplace))))
+    assert found in (["COMPLETE", "RUNNING", "WAITING", "WAITING"], ["RUNNING", "WAITING", "WAITING", "WAITING"])
 
 
 def dead_process() -> str:
-    """The name of a process of this machine that is gone."""
+    """The name of a process of this machine that has ended."""
     with subprocess.Popen(["true"]) as process:
         process.wait()
-    return f"{machine()}:{process.pid}"
+    return f"{identify_machine()}:{process.pid}"
 
 
 def last(study: optuna.Study) -> FrozenTrial:
     return study.get_trials()[-1]
 
 
-def test_a_trial_may_be_interrupted_more_often_than_its_process_may_die(
-    workplace: Workplace, study: optuna.Study, storage: PatientStorage
+def test_a_trial_may_be_interrupted_more_often_than_its_process_is_killed(
+    workplace: Workplace, study: optuna.Study, storage: RDBStorage
 ) -> None:
     study.enqueue_trial({"x": 0.5})
     for _ in range(5):
         number = study.ask().number
         study.tell(number, state=TrialState.FAIL)
-        assert queue_again(study, study.trials[number], died=False) == number + 1
+        assert queue_again(study, study.trials[number], lost=False) == number + 1
     for again in (True, True, True, False):
         study.ask().set_user_attr("process", dead_process())
         dead = last(study).number
-        assert recover(study, storage, workplace.client) == ({dead} if again else set())
+        assert recover_trials(study, storage, workplace.client) == (again, not again)
         assert study.trials[dead].state == TrialState.FAIL
     assert states(study) == ["FAIL"] * 9
     assert last(study).system_attrs["fixed_params"] == {"x": 0.5}
@@ -115,16 +122,16 @@ def test_a_trial_may_be_interrupted_more_often_than_its_process_may_die(
 
 @pytest.mark.parametrize("host", [f"{socket.gethostname()} 01234567", socket.gethostname()])
 def test_trials_of_another_machine_of_the_same_name_are_left_alone(
-    host: str, workplace: Workplace, study: optuna.Study, storage: PatientStorage
+    host: str, workplace: Workplace, study: optuna.Study, storage: RDBStorage
 ) -> None:
-    study.ask().set_user_attr("process", dead_process().replace(machine(), host))
+    study.ask().set_user_attr("process", dead_process().replace(identify_machine(), host))
     study.ask().set_user_attr("process", process_name())
-    assert recover(study, storage, workplace.client) == set()
+    assert recover_trials(study, storage, workplace.client) == (0, 0)
     assert states(study) == ["RUNNING"] * 2
 
 
 @pytest.fixture
-def job(workplace: Workplace, storage: PatientStorage, monkeypatch: pytest.MonkeyPatch) -> workers.Job:
+def job(workplace: Workplace, storage: RDBStorage, monkeypatch: pytest.MonkeyPatch) -> workers.Job:
     """A study with a run in MLflow."""
     monkeypatch.chdir(workplace.folder)
     monkeypatch.setenv("MLFLOW_TRACKING_URI", workplace.uri)
@@ -156,13 +163,13 @@ def test_a_second_ctrl_c_does_not_lose_the_trial_of_the_first(
     monkeypatch.setattr(workers, "run_trial", press)
     monkeypatch.setattr(workers, "queue_again", press_and_queue)
     with pytest.raises(KeyboardInterrupt):
-        workers.run_alone(job, 2, lambda: None)
-    assert states(job.open(job.connect())) == ["FAIL", "WAITING"]
+        workers.run_here(job, 2, lambda: None)
+    assert states(job.open()[0]) == ["FAIL", "WAITING"]
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError, AssertionError])
-def test_a_failed_trial_is_none_of_the_next_one_s_business(
+def test_a_failed_trial_does_not_hide_an_error_of_the_next(
     error: type[BaseException], job: workers.Job, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Ctrl-C, or a sampler's mistake, while Optuna chooses the next trial's values."""
@@ -170,30 +177,28 @@ def test_a_failed_trial_is_none_of_the_next_one_s_business(
     def fail(*args: object) -> NoReturn:
         raise error
 
-    storage = job.connect()
-    study = job.open(storage)
+    study, storage = job.open()
     monkeypatch.setattr(workers, "run_trial", lambda *args: 1 / 0)
-    assert workers._run_one(study, storage, job)
+    assert workers.run_next_trial(study, storage, job)
     monkeypatch.setattr(study.sampler, "before_trial", fail)
     with pytest.raises(error):
-        workers._run_one(study, storage, job)
+        workers.run_next_trial(study, storage, job)
     assert states(study) == ["FAIL", "RUNNING"]
 
 
-def test_a_ctrl_c_in_a_trial_that_was_taken_for_dead_ends_the_sweep(
+def test_a_ctrl_c_in_a_trial_that_another_process_has_failed_ends_the_sweep(
     job: workers.Job, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    storage = job.connect()
-    study = job.open(storage)
+    study, storage = job.open()
 
     def press(trial: optuna.Trial, *args: object) -> NoReturn:
-        storage.set_trial_state_values(trial._trial_id, TrialState.FAIL)
+        study.tell(trial.number, state=TrialState.FAIL)
         raise KeyboardInterrupt
 
     monkeypatch.setattr(workers, "run_trial", press)
     with pytest.raises(KeyboardInterrupt):
-        workers._run_one(study, storage, job)
-    assert states(study) == ["FAIL"], "whoever took it for dead has queued it again"
+        workers.run_next_trial(study, storage, job)
+    assert states(study) == ["FAIL"], "the process that failed it has queued it again"
 
 
 def test_ctrl_c_in_the_middle_of_two_workers_trials(workplace: Workplace, capsys: pytest.CaptureFixture[str]) -> None:
@@ -207,10 +212,10 @@ def test_ctrl_c_in_the_middle_of_two_workers_trials(workplace: Workplace, capsys
             assert time.monotonic() < deadline
             time.sleep(0.05)
         first.send_signal(signal.SIGINT)  # to the command alone, which passes it on
-        _, told = first.communicate(timeout=200)
-    assert first.returncode == 130, told
-    assert "interrupted; the same command goes on" in told
-    assert "Traceback" not in told
+        _, errors = first.communicate(timeout=200)
+    assert first.returncode == 130, errors
+    assert "interrupted; the same command goes on" in errors
+    assert "Traceback" not in errors
     study = optuna.load_study(study_name=STUDY, storage=address(workplace))
     assert states(study) == ["FAIL", "FAIL", "WAITING", "WAITING"]
     assert {trial.user_attrs["reason"] for trial in study.trials[:2]} == {"interrupted"}
@@ -227,8 +232,26 @@ def test_ctrl_c_in_the_middle_of_two_workers_trials(workplace: Workplace, capsys
     ]  # fmt: skip
 
 
+def test_workers_of_a_killed_command_finish_their_trials_and_end(workplace: Workplace) -> None:
+    waiter = {"class_path": "tests.helpers.WaitAt", "init_args": {"folder": str(workplace.folder)}}
+    file = write(
+        workplace, sampler="grid", space={"model.units": [4, 5, 6, 7]}, settings={"trainer.callbacks": [waiter]}
+    )
+    with workplace.start("sweep", file, "--workers", "2") as command:
+        deadline = time.monotonic() + 200
+        while len(list(workplace.folder.glob("waits-*"))) < 2:
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        command.kill()
+        processes = [psutil.Process(int(f.name.removeprefix("waits-"))) for f in workplace.folder.glob("waits-*")]
+        (workplace.folder / "go").touch()
+        assert psutil.wait_procs(processes, timeout=100)[1] == []
+    study = optuna.load_study(study_name=STUDY, storage=address(workplace))
+    assert sorted(states(study)) == ["COMPLETE", "COMPLETE", "WAITING", "WAITING"]
+
+
 class Fitted:
-    """What training leaves: the epochs that it was told."""
+    """Stands for training: it measures the given epochs."""
 
     curves: dict[str, dict[int, float]] = {}  # noqa: RUF012
     epochs: list[dict[str, float]] = [{"val/loss": 1.0} | dict.fromkeys(BOTH, 0.5)]  # noqa: RUF012
@@ -239,24 +262,23 @@ class Fitted:
 
 
 def run_one(job: workers.Job) -> FrozenTrial:
-    storage = job.connect()
-    study = job.open(storage)
-    assert workers._run_one(study, storage, job)
+    study, storage = job.open()
+    assert workers.run_next_trial(study, storage, job)
     return last(study)
 
 
 def test_a_study_whose_run_is_deleted_goes_on(
     job: workers.Job, workplace: Workplace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(trial, "_TrialCLI", Fitted)
+    monkeypatch.setattr(trial, "TrialCLI", Fitted)
     workplace.client.delete_run(job.parent)
     assert run_one(job).state == TrialState.COMPLETE
 
 
-def test_a_number_that_is_none_has_a_reason(
+def test_a_value_that_is_no_number_has_a_reason(
     job: workers.Job, workplace: Workplace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(trial, "_TrialCLI", Fitted)
+    monkeypatch.setattr(trial, "TrialCLI", Fitted)
     monkeypatch.setattr(Fitted, "epochs", [{"val/loss": 1.0, BOTH[0]: 0.5, BOTH[1]: float("nan")}])
     ended = run_one(job)
     assert ended.state == TrialState.FAIL
@@ -275,7 +297,9 @@ def test_a_trial_without_a_run_has_a_reason(job: workers.Job, monkeypatch: pytes
 
 
 @pytest.mark.parametrize("gone", ["mlflow", "optuna"])
-def test_a_store_that_fails_hides_no_ctrl_c(gone: str, job: workers.Job, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_ctrl_c_ends_the_sweep_although_a_store_fails(
+    gone: str, job: workers.Job, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def fail(*args: Any, **kwargs: Any) -> NoReturn:
         raise MlflowException("out of reach") if gone == "mlflow" else StorageInternalError
 
@@ -283,8 +307,8 @@ def test_a_store_that_fails_hides_no_ctrl_c(gone: str, job: workers.Job, monkeyp
         monkeypatch.setattr(*((MlflowClient, "set_tag") if gone == "mlflow" else (optuna.Trial, "set_user_attr")), fail)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(trial, "_TrialCLI", press)
-    study = job.open(job.connect())
+    monkeypatch.setattr(trial, "TrialCLI", press)
+    study, _ = job.open()
     with pytest.raises(KeyboardInterrupt):
         run_trial(study.ask(), job.plan, job.parent)
 

@@ -1,25 +1,26 @@
-"""The study's own run: who ends it, and what becomes of one that is deleted."""
+"""The study's own run: which command ends it, and what happens to one that is deleted."""
 
 from __future__ import annotations
 
 from typing import Any
 
-import optuna
 import pytest
 import yaml
 
-from lightning_pose.commands import sweep
+from lightning_pose.sweeps import workers
 from tests.helpers import Workplace
 
 
-def test_a_run_that_is_deleted_meanwhile_is_made_anew(workplace: Workplace, monkeypatch: pytest.MonkeyPatch) -> None:
-    run = sweep._run
+def test_a_run_that_is_deleted_meanwhile_is_created_again(
+    workplace: Workplace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_here = workers.run_here
 
-    def and_delete(study: optuna.Study, *args: Any) -> None:
-        run(study, *args)
-        workplace.client.delete_run(study.user_attrs["mlflow_run"])
+    def and_delete(job: workers.Job, *args: Any) -> None:
+        run_here(job, *args)
+        workplace.client.delete_run(job.parent)
 
-    monkeypatch.setattr(sweep, "_run", and_delete)
+    monkeypatch.setattr(workers, "run_here", and_delete)
     file = workplace.folder / "units.yaml"
     entries = {"base": "tiny.yaml", "settings": {"trainer.max_epochs": 1}, "space": {"model.units": [4]}}
     file.write_text(yaml.safe_dump(entries))

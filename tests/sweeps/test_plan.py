@@ -1,4 +1,4 @@
-"""The plan of a sweep: what the command line narrows, which objective means something, and what best.yaml holds."""
+"""The plan of a sweep: what the command line narrows, which objectives are allowed, and the content of best.yaml."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import yaml
 
-from lightning_pose.commands.sweep import _read_value
+from lightning_pose.commands.sweep import parse_value
 from lightning_pose.errors import ConfigError
 from lightning_pose.studies.figure_spec import parse_figure_spec
 from lightning_pose.sweeps.base_config import ParsedConfig
@@ -34,7 +34,7 @@ def sweep(workplace: Workplace) -> Write:
     return write
 
 
-def test_losses_that_differ_do_not_choose(sweep: Write) -> None:
+def test_losses_that_differ_are_no_objective(sweep: Write) -> None:
     both = ["tiny.yaml", "split.yaml"]
     assert read_plan(sweep(), {}).objectives[0].metric == "val/loss"
     assert read_plan(sweep(base=both), {}).objectives[0].metric == "val/position_median_m"
@@ -57,7 +57,7 @@ def test_a_narrowed_parameter_keeps_its_condition(sweep: Write) -> None:
         assert "model.units" not in plan.settings
 
 
-def test_what_others_wait_for_may_be_narrowed_away(sweep: Write) -> None:
+def test_a_value_that_a_condition_names_may_be_narrowed_away(sweep: Write) -> None:
     space = {"model.cell": ["gru", "lstm"], "model.layers": {"choices": [1, 2], "when": {"model.cell": "lstm"}}}
     plan = read_plan(sweep(space=space), {"space.model.cell": ["gru"]})
     assert plan.space[0].example() == ["gru"]
@@ -80,7 +80,7 @@ def test_a_class_that_is_searched_is_written_with_its_settings(sweep: Write, wor
     [("2024-05-01", "2024-05-01"), ("00", "00"), ("0x10", "0x10"), ("7", 7), ("[1, 2]", [1, 2]), ("null", None)],
 )
 def test_folders_that_look_like_dates_and_numbers(text: str, value: Any) -> None:
-    assert _read_value(text) == value
+    assert parse_value(text) == value
 
 
 def test_a_folder_of_digits_stays_a_folder(sweep: Write) -> None:

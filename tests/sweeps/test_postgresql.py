@@ -1,4 +1,4 @@
-"""Studies in PostgreSQL: several commands at once, one that is killed, outages, and addresses that do not do."""
+"""Studies in PostgreSQL: several commands at once, one that is killed, outages, and wrong addresses."""
 
 from __future__ import annotations
 
@@ -11,15 +11,14 @@ from typing import LiteralString
 import optuna
 import pytest
 import yaml
-from optuna.exceptions import StorageInternalError
 from optuna.storages import RDBStorage
 from optuna.trial import FrozenTrial, TrialState
+from sqlalchemy.exc import OperationalError
 from sqlalchemy.pool import NullPool
 
 from lightning_pose.models import SurfLSTM
-from lightning_pose.sweeps import outages
 from lightning_pose.sweeps import storage as studies
-from lightning_pose.sweeps.storage import alone
+from lightning_pose.sweeps.storage import lock_study
 from lightning_pose.sweeps.study import open_storage
 from tests.helpers import Workplace
 from tests.postgres import PASSWORD, serve
@@ -64,9 +63,9 @@ def trials(database: str) -> list[FrozenTrial]:
 def test_commands_share_a_study_and_another_goes_on(workplace: Workplace, sweep: list[str], database: str) -> None:
     commands = [workplace.start(*sweep[:-1], "2") for _ in range(2)]
     for command in commands:
-        _, told = command.communicate(timeout=200)
-        assert command.returncode == 0, told
-        assert PASSWORD not in told
+        _, errors = command.communicate(timeout=200)
+        assert command.returncode == 0, errors
+        assert PASSWORD not in errors
     assert workplace.command(*sweep) == 0
     assert [(t.number, t.state) for t in trials(database)] == [(n, TrialState.COMPLETE) for n in range(5)]
     assert len({trial.user_attrs["process"] for trial in trials(database)}) == 3
@@ -81,8 +80,8 @@ def test_a_killed_command_s_trial_is_run_by_the_next(
     killer = {"class_path": "tests.helpers.KillOnce", "init_args": {"marker": str(workplace.folder / "killed")}}
     sweep = [*sweep, "--trainer.callbacks", json.dumps([killer])]
     with workplace.start(*sweep) as command:
-        _, told = command.communicate(timeout=200)
-    assert command.returncode == -signal.SIGKILL, told
+        _, errors = command.communicate(timeout=200)
+    assert command.returncode == -signal.SIGKILL, errors
     assert [trial.state for trial in trials(database)] == [TrialState.RUNNING]
     assert workplace.command(*sweep) == 0
     assert "the process of trial 0 died; it is run again as trial 1" in capsys.readouterr().err
@@ -94,19 +93,22 @@ def test_a_killed_command_s_trial_is_run_by_the_next(
 
 
 class Restart:
-    """A server that restarts: nobody is connected to the studies, nor can be, until someone pauses before trying again.
+    """A server that restarts: it closes all connections to the studies and refuses others until the first pause.
 
-    It stands for the module `time` of those who pause.
+    It replaces the module `time` where connections are tried again; time passes in pauses only.
 
     Attributes:
         pauses: how many there have been.
+        waited: their seconds.
+        lasts: whether the server stays out of reach.
     """
-
-    monotonic = staticmethod(time.monotonic)
 
     def __init__(self, server: str) -> None:
         self.server = server
-        self.pauses = 0
+        self.pauses, self.waited, self.lasts = 0, 0.0, False
+
+    def monotonic(self) -> float:
+        return self.waited
 
     def begin(self) -> None:
         terminate = "SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE datname = 'studies'"
@@ -114,7 +116,9 @@ class Restart:
 
     def sleep(self, seconds: float) -> None:
         self.pauses += 1
-        self._execute("ALTER DATABASE studies ALLOW_CONNECTIONS true")
+        self.waited += seconds
+        if not self.lasts:
+            self._execute("ALTER DATABASE studies ALLOW_CONNECTIONS true")
 
     def _execute(self, *statements: LiteralString) -> None:
         import psycopg
@@ -127,36 +131,32 @@ class Restart:
 @pytest.fixture
 def restart(server: str, monkeypatch: pytest.MonkeyPatch) -> Restart:
     restart = Restart(server)
-    monkeypatch.setattr(outages, "time", restart)
+    monkeypatch.setattr(studies, "time", restart)
     return restart
 
 
-def test_a_trial_outlives_a_restart_of_the_server(
+def test_a_trial_goes_on_after_a_restart_of_the_server(
     workplace: Workplace, sweep: list[str], database: str, restart: Restart, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In the middle of an epoch: its heart beats in vain, the report waits for the server, and then the heart beats."""
-    beats: list[str] = []
-    beat = RDBStorage.record_heartbeat
+    """In the middle of an epoch: a heartbeat or the report waits for the server, and heartbeats follow."""
+    beats: list[int] = []
+    record = RDBStorage.record_heartbeat
 
     def count(self: RDBStorage, trial_id: int) -> None:
-        try:
-            beat(self, trial_id)
-        except StorageInternalError:
-            beats.append("vain")
-            raise
-        beats.append("heard")
+        record(self, trial_id)
+        beats.append(trial_id)
 
-    def await_beats(*awaited: str) -> None:
+    def await_heartbeats(number: int) -> None:
         deadline = time.monotonic() + 60
-        while tuple(beats[-len(awaited) :]) != awaited:
+        while len(beats) < number:
             assert time.monotonic() < deadline, beats
             time.sleep(0.05)
 
     def train(self: SurfLSTM) -> None:
-        await_beats("heard")
         if self.current_epoch == 0:
+            await_heartbeats(1)
             restart.begin()
-            await_beats("vain", "vain")
+            await_heartbeats(len(beats) + 2)
 
     monkeypatch.setattr(studies, "HEARTBEAT_SECONDS", 1)
     monkeypatch.setattr(RDBStorage, "record_heartbeat", count)
@@ -166,15 +166,24 @@ def test_a_trial_outlives_a_restart_of_the_server(
     assert restart.pauses >= 1
 
 
-def test_who_is_alone_outlives_a_restart(
+def test_the_lock_of_a_study_is_free_after_a_restart(
     workplace: Workplace, database: str, restart: Restart, capfd: pytest.CaptureFixture[str]
 ) -> None:
     storage = open_storage(database, workplace.uri)
-    with alone(storage, STUDY):
+    with lock_study(storage, STUDY):
         restart.begin()
-    with alone(storage, STUDY):
+    with lock_study(storage, STUDY):
         assert restart.pauses == 1
     assert capfd.readouterr().err == "the study's database is out of reach; it is tried again\n"
+
+
+def test_an_outage_is_waited_for_two_minutes(workplace: Workplace, database: str, restart: Restart) -> None:
+    storage = open_storage(database, workplace.uri)
+    restart.lasts = True
+    restart.begin()
+    with pytest.raises(OperationalError), lock_study(storage, STUDY):
+        pass
+    assert 100 < restart.waited <= 120
 
 
 MISTAKES = {

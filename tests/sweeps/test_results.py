@@ -1,4 +1,4 @@
-"""What a sweep leaves: figures that know which way is better, names that tell apart, and figures that cannot be."""
+"""The results of a sweep: figures with the right direction, distinct names, and figures that cannot be drawn."""
 
 from __future__ import annotations
 
@@ -14,17 +14,10 @@ from optuna.distributions import FloatDistribution
 from optuna.study import StudyDirection
 from optuna.trial import create_trial
 
-from lightning_pose.studies.table import Cell, name_scenes
-from lightning_pose.sweeps import results
+from lightning_pose.studies.table import Group, name_scenes
 from lightning_pose.sweeps.plan import Objective
+from lightning_pose.sweeps.results import plan_figures
 from tests.helpers import Workplace
-
-
-class FakePlan:
-    """What figures need to know of a plan."""
-
-    def __init__(self, *objectives: Objective) -> None:
-        self.objectives = objectives
 
 
 def study_of(*directions: str) -> optuna.Study:
@@ -40,7 +33,7 @@ def study_of(*directions: str) -> optuna.Study:
 
 @pytest.mark.parametrize("direction", ["minimize", "maximize"])
 def test_the_history_has_the_best_so_far(direction: str) -> None:
-    figures = dict(results._figures(study_of(direction), FakePlan(Objective("v", direction == "maximize"))))  # type: ignore[arg-type]
+    figures = dict(plan_figures(study_of(direction), [Objective("v", direction == "maximize")]))
     axes: Any = figures["history"]()
     labels = axes.get_legend_handles_labels()[1]
     assert "Best Value" in labels
@@ -56,8 +49,8 @@ def test_importance_is_that_for_the_best_also_among_several_objectives(monkeypat
     asked: dict[str, Any] = {}
     monkeypatch.setattr(draw, "plot_param_importances", lambda study, **named: asked.update(named))
     study = study_of("maximize", "minimize")
-    plan = FakePlan(Objective("val/recall_5cm_5deg", True), Objective("cost/parameters"))
-    figures = dict(results._figures(study, plan))  # type: ignore[arg-type]
+    objectives = [Objective("val/recall_5cm_5deg", True), Objective("cost/parameters")]
+    figures = dict(plan_figures(study, objectives))
     trial = study.trials[-1]
     figures["importance_val_recall_5cm_5deg"]()
     assert asked["target"](trial) == -trial.values[0]
@@ -65,11 +58,11 @@ def test_importance_is_that_for_the_best_also_among_several_objectives(monkeypat
     assert asked["target"](trial) == trial.values[1]
 
 
-def test_folders_of_one_name_are_told_apart() -> None:
+def test_folders_of_one_name_have_distinct_names() -> None:
     def names(*roots: Any) -> list[str]:
-        cells = [Cell({"data.root": root}) for root in roots]
-        name_scenes(cells)
-        return [cell.names["data.root"] for cell in cells]
+        groups = [Group({"data.root": root}) for root in roots]
+        name_scenes(groups)
+        return [group.names["data.root"] for group in groups]
 
     assert names("/data/chess/", "/data/fire") == ["chess", "fire"]
     assert names("apt1/kitchen", "apt2/kitchen", None) == ["apt1/kitchen", "apt2/kitchen", "none"]
@@ -88,7 +81,7 @@ def study_file(workplace: Workplace) -> Callable[..., Path]:
     return write
 
 
-def test_a_figure_of_what_was_not_measured_loses_nothing(
+def test_a_figure_of_what_was_not_measured_is_refused_after_the_results(
     workplace: Workplace, study_file: Callable[..., Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = workplace.folder / "mlruns" / "sweeps" / "study-wall"

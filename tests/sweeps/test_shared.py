@@ -1,4 +1,4 @@
-"""A study that several processes and machines work at: who takes what, and what becomes of those who fall silent."""
+"""A study that several processes and machines share: each trial is run once, and lost ones are run again."""
 
 from __future__ import annotations
 
@@ -20,9 +20,10 @@ from optuna.trial import Trial, TrialState
 
 from lightning_pose.models import SurfLSTM
 from lightning_pose.sweeps import storage
+from lightning_pose.sweeps import workers as runners
 from lightning_pose.sweeps.plan import read_plan
-from lightning_pose.sweeps.space import draw
-from lightning_pose.sweeps.study import SAMPLERS, attach, open_storage, open_study
+from lightning_pose.sweeps.space import draw_values
+from lightning_pose.sweeps.study import SAMPLERS, load_study, open_storage, open_study
 from tests.helpers import Workplace
 
 SPACE = {
@@ -48,12 +49,12 @@ def load(workplace: Workplace) -> optuna.Study:
     return optuna.load_study(study_name="units-wall", storage=address(workplace))
 
 
-def test_two_commands_run_each_cell_of_a_grid_once(workplace: Workplace) -> None:
+def test_two_commands_run_each_grid_point_once(workplace: Workplace) -> None:
     units = [4, 5, 6, 7]
     file = write(workplace, sampler="grid", space={"model.units": units})
     for command in [workplace.start("sweep", file) for _ in range(2)]:
-        _, told = command.communicate(timeout=200)
-        assert command.returncode == 0, told
+        _, errors = command.communicate(timeout=200)
+        assert command.returncode == 0, errors
     trials = load(workplace).trials
     assert [trial.state for trial in trials] == [TrialState.COMPLETE] * 4
     assert sorted(trial.params["model.units"] for trial in trials) == units
@@ -62,20 +63,20 @@ def test_two_commands_run_each_cell_of_a_grid_once(workplace: Workplace) -> None
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_cells_that_others_take_are_not_made_up_for(
+def test_grid_points_that_others_take_are_not_replaced(
     workers: int, workplace: Workplace, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A command that begins with three cells, of which another takes two at once, runs one and nothing else."""
-    from lightning_pose.commands import sweep
+    """A command that begins with three grid points, of which another takes two at once, runs one and nothing else."""
+    name = "run_here" if workers == 1 else "run_in_processes"
+    run = getattr(runners, name)
 
-    run = sweep._run
-
-    def robbed(study: optuna.Study, *args: Any) -> None:
+    def run_the_rest(*args: Any) -> None:
+        study = load(workplace)
         for _ in range(2):
             study.tell(study.ask(), 1.0)
-        run(study, *args)
+        run(*args)
 
-    monkeypatch.setattr(sweep, "_run", robbed)
+    monkeypatch.setattr(runners, name, run_the_rest)
     file = write(workplace, sampler="grid", space={"model.units": [4, 5, 6]})
     assert workplace.command("sweep", file, "--workers", str(workers)) == 0
     assert "trial 1/3" in capsys.readouterr().err
@@ -83,7 +84,7 @@ def test_cells_that_others_take_are_not_made_up_for(
 
 
 def of_another_machine(workplace: Workplace, minutes: int) -> tuple[int, str]:
-    """A trial that runs elsewhere and last gave a sign of life these minutes ago; its number and MLflow run."""
+    """A trial that runs elsewhere, whose last heartbeat is so many minutes old; its number and MLflow run."""
     storage = open_storage(address(workplace), workplace.uri)
     study = optuna.load_study(study_name="units-wall", storage=storage)
     trial = study.ask()
@@ -93,21 +94,24 @@ def of_another_machine(workplace: Workplace, minutes: int) -> tuple[int, str]:
     run = workplace.client.create_run(parent.info.experiment_id, tags=tags).info.run_id
     trial.set_user_attr("process", "elsewhere:7")
     trial.set_user_attr("mlflow_run", run)
-    storage.record_heartbeat(trial._trial_id)
+    trial_id = storage.get_trial_id_from_study_id_trial_number(
+        storage.get_study_id_from_name("units-wall"), trial.number
+    )
+    storage.record_heartbeat(trial_id)
     with storage.engine.begin() as connection:
         moved = f"UPDATE trial_heartbeats SET heartbeat = datetime('now', '-{minutes} minutes') WHERE trial_id = :trial"
-        assert connection.execute(sqlalchemy.text(moved), {"trial": trial._trial_id}).rowcount == 1
+        assert connection.execute(sqlalchemy.text(moved), {"trial": trial_id}).rowcount == 1
     return trial.number, run
 
 
-def test_a_machine_that_falls_silent_loses_its_trial(workplace: Workplace, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_trial_without_heartbeats_is_run_again(workplace: Workplace, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["sweep", write(workplace), "--n_trials", "1"]
     assert workplace.command(*command) == 0
     silent, silent_run = of_another_machine(workplace, minutes=5)
     busy, busy_run = of_another_machine(workplace, minutes=0)
     capsys.readouterr()
     assert workplace.command(*command) == 0
-    assert "the process of trial 1 fell silent; it is run again as trial 3" in capsys.readouterr().err
+    assert "the process of trial 1 sent no heartbeat; it is run again as trial 3" in capsys.readouterr().err
     trials = load(workplace).trials
     assert [trial.state.name for trial in trials] == ["COMPLETE", "FAIL", "RUNNING", "COMPLETE"]
     assert trials[3].params["model.units"] == trials[silent].params["model.units"]
@@ -115,7 +119,7 @@ def test_a_machine_that_falls_silent_loses_its_trial(workplace: Workplace, capsy
     assert (silent, busy) == (1, 2)
     runs = {run.info.run_id: run for run in workplace.runs()}
     assert runs[silent_run].info.status == "KILLED"
-    assert runs[silent_run].data.tags["sweep.reason"] == "its process fell silent"
+    assert runs[silent_run].data.tags["sweep.reason"] == "its process sent no heartbeat"
     assert runs[busy_run].info.status == "RUNNING"
 
 
@@ -135,27 +139,29 @@ def test_a_study_s_run_ends_with_the_last_command_that_works_at_it(workplace: Wo
     assert status() == "FINISHED"
 
 
-def test_a_trial_gives_signs_of_life_while_it_trains(workplace: Workplace, monkeypatch: pytest.MonkeyPatch) -> None:
-    signs: set[str] = set()
+def test_a_trial_sends_heartbeats_while_it_trains(workplace: Workplace, monkeypatch: pytest.MonkeyPatch) -> None:
+    heartbeats: set[str] = set()
 
-    def listen(self: SurfLSTM) -> None:
+    def wait_for_two(self: SurfLSTM) -> None:
         with sqlalchemy.create_engine(address(workplace)).connect() as connection:
             deadline = time.monotonic() + 20
-            while len(signs) < 2 and time.monotonic() < deadline:
-                signs.update(connection.execute(sqlalchemy.text("SELECT heartbeat FROM trial_heartbeats")).scalars())
+            while len(heartbeats) < 2 and time.monotonic() < deadline:
+                heartbeats.update(
+                    connection.execute(sqlalchemy.text("SELECT heartbeat FROM trial_heartbeats")).scalars()
+                )
                 connection.rollback()
                 time.sleep(0.1)
 
     monkeypatch.setattr(storage, "HEARTBEAT_SECONDS", 1)
-    monkeypatch.setattr(SurfLSTM, "on_train_epoch_start", listen)
+    monkeypatch.setattr(SurfLSTM, "on_train_epoch_start", wait_for_two)
     assert workplace.command("sweep", write(workplace), "--n_trials", "1") == 0
-    assert len(signs) >= 2
+    assert len(heartbeats) >= 2
 
 
-def test_a_trial_that_was_taken_for_dead_does_not_end_the_sweep(
+def test_a_trial_that_another_process_has_failed_does_not_end_the_sweep(
     workplace: Workplace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As on a machine that slept while another took its trial over."""
+    """As on a machine that was suspended while another queued its trial again."""
     taken: list[int] = []
 
     def take(self: SurfLSTM) -> None:
@@ -183,10 +189,10 @@ def test_every_sampler_samples(name: str, workplace: Workplace) -> None:
     plan = read_plan(file, {})
     storage = open_storage(address(workplace), workplace.uri)
     open_study(plan, "units-wall", storage)
-    study = attach(plan, "units-wall", storage)
+    study = load_study(plan, "units-wall", storage)
 
     def objective(trial: Trial) -> float:
-        values = draw(trial, plan.space)
+        values = draw_values(trial, plan.space)
         return values["model.units"] * values["model.learning_rate"]
 
     study.optimize(objective, n_trials=6)
