@@ -17,6 +17,7 @@ from lightning_pose.errors import ConfigError, DataError
 from lightning_pose.features import FeatureCache, FeatureExtractor
 from lightning_pose.features.cache import FillReport
 from lightning_pose.paths import cache_folder
+from lightning_pose.scenes.images import read_gray
 from lightning_pose.scenes.scene import Scene
 from lightning_pose.scenes.synthetic import RENDERER_VERSION, render_room
 
@@ -101,6 +102,12 @@ class SceneDataModule(LightningDataModule):
         if split not in self._datasets:
             self._datasets[split] = self._make_dataset(split, self._read(split, self.cache))
         return self._datasets[split]
+
+    def measure_image(self, split: str) -> tuple[int, int]:
+        """Width and height of the first image of a split; those of a scene are alike."""
+        first = self.scene.frames[int(self.scene.splits[split][0])]
+        height, width = read_gray(first.image).shape
+        return width, height
 
     def _make_dataset(self, split: str, data: PoseBatch) -> PoseDataset:
         """Items of a split, from its frames."""

@@ -177,8 +177,7 @@ class LandmarkMap(TrainingMemory, PoseModule):
         """The camera of the setting, of the dataset, or with the focal length that fits the training poses."""
         scene = datamodule.scene
         first = scene.frames[int(scene.splits["train"][0])]
-        record = next(iter(datamodule.cache.records([first.image], workers=1, progress=False)))
-        width, height = record["image_size"].tolist()
+        width, height = datamodule.measure_image("train")
         if self.camera is not None:
             return self.camera.resize(width, height)
         if first.intrinsics is not None:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 from torch import nn
 from torch.utils.data import DataLoader
 
@@ -13,8 +15,12 @@ from lightning_pose import models
 from lightning_pose.data import ClipDataModule, SceneDataModule
 from lightning_pose.data.batches import PoseBatch, PoseDataset, make_loader
 from lightning_pose.data.clip_dataset import ClipDataset, ClipShape
+from lightning_pose.features import SURF
+from lightning_pose.mapping.frames import MapFrames
 from lightning_pose.models import PoseModule
+from lightning_pose.scenes.scene import Frame, Scene
 from tests.helpers import Thumbnails
+from tests.mapping.helpers import FOCAL_PX, make_frames, make_walk
 
 __all__ = [
     "ARCHITECTURES",
@@ -22,8 +28,10 @@ __all__ = [
     "ClipProblem",
     "LearnableProblem",
     "SmallCNN",
+    "WallProblem",
     "features_for",
     "make_model",
+    "problem_class_for",
     "problem_for",
     "random_poses",
 ]
@@ -31,6 +39,8 @@ __all__ = [
 _INPUT_SHAPES = {1: [32], 2: [20, 64], 3: [16, 3, 4]}
 
 CLIP_LENGTH = 4
+
+WALL_KEYPOINTS = 250
 
 _SEEDS = {"train": 0, "val": 11, "test": 12}  # of the frames of each split
 
@@ -47,6 +57,8 @@ def make_model(architecture: type[PoseModule], **settings: object) -> PoseModule
     torch.manual_seed(0)
     if architecture is models.PoseNet:
         small = {"backbone": "tests.models.helpers.SmallCNN", "crop": 12, "input_shape": [3, 12, 12]}
+    elif architecture is models.LandmarkMap:
+        small = {"input_shape": [WALL_KEYPOINTS, 36], "camera": "PINHOLE,640,480,500,500,319.5,239.5"}
     else:
         small = {"input_shape": _INPUT_SHAPES[architecture.input_ranks[0]]}
     model = architecture(**{**small, **settings})  # type: ignore[arg-type]
@@ -83,9 +95,16 @@ def features_for(model: PoseModule, count: int, seed: int = 0) -> torch.Tensor:
     return torch.randn(count, *axes, *model.input_shape, generator=torch.Generator().manual_seed(seed))
 
 
+def problem_class_for(model: PoseModule) -> type[LearnableProblem]:
+    """A problem that the model can learn: of clips where it reads those, of a wall where it reads keypoints."""
+    if isinstance(model, models.LandmarkMap):
+        return WallProblem
+    return ClipProblem if model.reads_clips else LearnableProblem
+
+
 def problem_for(model: PoseModule) -> LearnableProblem:
-    """A problem that the model can learn, of clips where it reads those."""
-    return (ClipProblem if model.reads_clips else LearnableProblem)(list(model.input_shape))
+    """A problem that the model can learn, for its shape of features."""
+    return problem_class_for(model)(list(model.input_shape))
 
 
 class LearnableProblem(SceneDataModule):
@@ -148,3 +167,40 @@ class ClipProblem(LearnableProblem, ClipDataModule):
 
     def train_dataloader(self) -> DataLoader[PoseBatch]:
         return make_loader(PoseDataset(self.learnt), batch_size=8, shuffle=True)
+
+
+class WallProblem(LearnableProblem):
+    """Keypoints of a wall as cameras along it see them, in the form of a local extractor with its geometry."""
+
+    def __init__(self, input_shape: list[int], count: int = 24) -> None:
+        super().__init__(input_shape, count)
+        self.extractor = SURF(input_shape[0], with_geometry=True)
+        frames, self.splits = [], {}
+        for number, (split, seed) in enumerate(_SEEDS.items()):
+            rotation, position_m = make_walk(count, seed)
+            wall = make_frames(rotation, position_m + np.array([0.0, 0.03, 0.02]) * number, seed=seed)
+            quats = Rotation.from_matrix(wall.rotation).as_quat(scalar_first=True)
+            position_m, quat_wxyz = (torch.from_numpy(pose).float() for pose in (wall.position, quats))
+            frame = torch.arange(count) + number * count
+            features = torch.from_numpy(wall_features(wall, input_shape[0]))
+            self.splits[split] = PoseDataset(PoseBatch(features, position_m, quat_wxyz, frame))
+            image = Path("wall.png")
+            frames += [Frame(image, c, q, split, i) for i, (c, q) in enumerate(zip(wall.position, quats, strict=True))]
+        self.data = self.splits["train"]
+        self.learnt = self.data.data
+        splits = {split: part.data.frame.numpy() for split, part in self.splits.items()}
+        self._scene = Scene("wall", Path("wall"), "wall", tuple(frames), splits)
+
+    def measure_image(self, split: str) -> tuple[int, int]:
+        return 640, 480
+
+
+def wall_features(wall: MapFrames, n: int) -> np.ndarray:
+    """(F, n, 36) float32: descriptors, x and y in -1 to 1, log2 of size by 16 pixels, response."""
+    pixels = wall.points * FOCAL_PX + [319.5, 239.5]
+    places = pixels / [320, 240] - 1
+    size = np.log2(np.maximum(wall.size_px, 1) / 16)[..., None]
+    rows = np.concatenate([wall.descriptors, places, size, np.zeros_like(size)], axis=2) * wall.real[..., None]
+    padded = np.zeros((len(wall), n, rows.shape[2]), np.float32)
+    padded[:, : rows.shape[1]] = rows[:, :n]
+    return padded
