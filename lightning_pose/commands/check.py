@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.progress import track
@@ -19,6 +20,9 @@ from lightning_pose.scenes.inspect import (
     read_image_files,
 )
 from lightning_pose.scenes.scene import SPLITS, Scene
+
+if TYPE_CHECKING:
+    from lightning_pose.mapping.pose_check import PoseCheck
 
 __all__ = ["main"]
 
@@ -37,10 +41,13 @@ def main(argv: list[str]) -> int:
     scene = load_scene(args.dir, args.format)
     reading = track(read_image_files(scene), "reading images", len(scene.frames), console=console, transient=True)
     files = list(reading)
-    console.print(_make_overview(scene, files))
+    with console.status("matching nearby frames"):
+        compared = _compare_poses(scene)
+    console.print(_make_overview(scene, files, compared.facts))
     console.print(_make_sequence_table(scene))
     in_images, in_poses = inspect_images(scene, files), inspect_poses(scene)
-    errors, warnings = in_images.errors + in_poses.errors, in_images.warnings + in_poses.warnings
+    errors = in_images.errors + in_poses.errors + compared.errors
+    warnings = in_images.warnings + in_poses.warnings + compared.warnings
     for kind, texts in (("error", errors), ("warning", warnings)):
         for text in texts:
             console.print(f"{kind}: {text}", markup=False, highlight=False, soft_wrap=True)
@@ -49,9 +56,15 @@ def main(argv: list[str]) -> int:
     return 2 if errors else 0
 
 
-def _make_overview(scene: Scene, files: list[ImageFile]) -> Table:
+def _compare_poses(scene: Scene) -> PoseCheck:
+    from lightning_pose.mapping.pose_check import check_poses  # torch, which takes seconds to import
+
+    return check_poses(scene)
+
+
+def _make_overview(scene: Scene, files: list[ImageFile], compared: dict[str, str]) -> Table:
     table = Table(title=f"{scene.name}: {len(scene.frames)} frames", show_header=False, title_justify="left")
-    for name, value in describe_scene(scene, files).items():
+    for name, value in (describe_scene(scene, files) | compared).items():
         table.add_row(name, value)
     return table
 

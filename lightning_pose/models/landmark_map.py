@@ -181,8 +181,8 @@ class LandmarkMap(TrainingMemory, PoseModule):
         if self.camera is not None:
             return self.camera.resize(width, height)
         if first.intrinsics is not None:
-            known = first.intrinsics
-            return Camera(width, height, known.fx, known.fy, known.cx, known.cy)
+            known = first.intrinsics.for_size(width, height)
+            return Camera(width, height, known.fx, known.fy, known.cx, known.cy, known.distortion)
         guess = Camera(width, height, 1.0, 1.0, (width - 1) / 2, (height - 1) / 2)
         frames = self._read_frames(datamodule, ("train",), guess)
         sequences = [scene.frames[i].sequence for i in datamodule.dataset("train").data.frame.tolist()]

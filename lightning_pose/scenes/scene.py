@@ -15,12 +15,31 @@ SPLITS = ("train", "val", "test")
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """Pinhole camera matrix entries, in pixels."""
+    """A camera, in pixels; the centre of the first pixel is (0, 0).
+
+    Attributes:
+        fx: focal length across.
+        fy: focal length down.
+        cx: principal point.
+        cy: principal point.
+        size: width and height of the images that the numbers are for; None for the images as they are.
+        distortion: OpenCV's coefficients k1 k2 p1 p2 k3 ...; empty for none.
+    """
 
     fx: float
     fy: float
     cx: float
     cy: float
+    size: tuple[int, int] | None = None
+    distortion: tuple[float, ...] = ()
+
+    def for_size(self, width: int, height: int) -> Intrinsics:
+        """The same camera for images that were resized to this size."""
+        if self.size is None or self.size == (width, height):
+            return self
+        x, y = width / self.size[0], height / self.size[1]
+        cx, cy = (self.cx + 0.5) * x - 0.5, (self.cy + 0.5) * y - 0.5
+        return Intrinsics(self.fx * x, self.fy * y, cx, cy, (width, height), self.distortion)
 
 
 @dataclass(frozen=True)

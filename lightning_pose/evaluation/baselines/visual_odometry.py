@@ -179,7 +179,8 @@ def describe_frame(frame: Frame) -> View:
     sift = SIFT(N_FEATURES)
     record = sift.extract([sift.read(frame.image)])[0]
     count = int(record["count"])
-    camera = frame.intrinsics or assume_intrinsics(*record["image_size"].tolist())
+    width, height = record["image_size"].tolist()
+    camera = frame.intrinsics.for_size(width, height) if frame.intrinsics else assume_intrinsics(width, height)
     pixels = record["keypoints"][:count, :2].astype(np.float64)
     points = (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
     return View(points, record["descriptors"][:count], 0.5 * (camera.fx + camera.fy))

@@ -23,7 +23,7 @@ __all__ = ["FORMAT", "IclNuim", "reflect_poses"]
 
 log = logging.getLogger("lightning_pose")
 
-CAMERA = Intrinsics(fx=481.20, fy=480.0, cx=319.5, cy=239.5)
+CAMERA = Intrinsics(fx=481.20, fy=480.0, cx=319.5, cy=239.5, size=(640, 480))
 FRAMES_PER_SECOND = 30.0
 
 

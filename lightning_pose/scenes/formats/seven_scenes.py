@@ -15,7 +15,7 @@ from lightning_pose.scenes.scene import Frame, Intrinsics, Scene
 __all__ = ["FORMAT", "SevenScenes"]
 
 SPLIT_FILES = {"train": "TrainSplit.txt", "test": "TestSplit.txt"}
-COLOUR = Intrinsics(fx=525.0, fy=525.0, cx=320.0, cy=240.0)
+COLOUR = Intrinsics(fx=525.0, fy=525.0, cx=320.0, cy=240.0, size=(640, 480))
 """Nominal values of the Kinect's colour camera, in pixels."""
 FRAME_FILE = re.compile(r"frame-(\d+)\.(?:(color\.(?:png|jpe?g))|(pose\.txt))")
 
@@ -110,6 +110,7 @@ def _read_intrinsics(root: Path) -> Intrinsics:
         return COLOUR
     try:
         camera = json.loads(path.read_text())["intrinsics"]
-        return Intrinsics(**{name: float(camera[name]) for name in ("fx", "fy", "cx", "cy")})
+        fx, fy, cx, cy = (float(camera[name]) for name in ("fx", "fy", "cx", "cy"))
+        return Intrinsics(fx, fy, cx, cy)
     except (ValueError, KeyError, TypeError) as error:
         raise DataError(f"{path}: no `intrinsics` of fx, fy, cx, cy ({error!r}); render the room again") from error

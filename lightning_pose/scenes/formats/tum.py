@@ -20,9 +20,9 @@ MAX_DIFFERENCE_S = 0.02
 """Largest difference in time between an image and its pose."""
 
 CAMERAS = {
-    "freiburg1": Intrinsics(fx=517.3, fy=516.5, cx=318.6, cy=255.3),
-    "freiburg2": Intrinsics(fx=520.9, fy=521.0, cx=325.1, cy=249.7),
-    "freiburg3": Intrinsics(fx=535.4, fy=539.2, cx=320.1, cy=247.6),
+    "freiburg1": Intrinsics(517.3, 516.5, 318.6, 255.3, (640, 480), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    "freiburg2": Intrinsics(520.9, 521.0, 325.1, 249.7, (640, 480), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    "freiburg3": Intrinsics(535.4, 539.2, 320.1, 247.6, (640, 480)),  # its images are undistorted
 }
 """The calibrated colour cameras of the benchmark, by a part of the folder's name."""
 

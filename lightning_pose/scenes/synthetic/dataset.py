@@ -7,7 +7,6 @@ import os
 import tempfile
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict
 from pathlib import Path
 
 import cv2
@@ -65,7 +64,7 @@ def render_room(
         "frames": frames,
         "size": list(size),
         "renderer_version": RENDERER_VERSION,
-        "intrinsics": asdict(make_camera(size)),
+        "intrinsics": {name: getattr(make_camera(size), name) for name in ("fx", "fy", "cx", "cy")},
     }
     if _holds_room(root, metadata):
         return root

@@ -50,7 +50,7 @@ def test_frames_are_paired_by_number(tmp_path: Path, caplog: pytest.LogCaptureFi
     np.testing.assert_allclose(frame.position_m, [1, -2, 3])
     np.testing.assert_allclose(frame.quat_wxyz, [0.5, -0.5, 0.5, -0.5])
     assert frame.timestamp == pytest.approx(2 / 30)
-    assert frame.intrinsics == Intrinsics(481.20, 480.0, 319.5, 239.5)
+    assert frame.intrinsics == Intrinsics(481.20, 480.0, 319.5, 239.5, size=(640, 480))
 
 
 def test_image_list_is_used_where_there_is_one(tmp_path: Path) -> None:

@@ -52,7 +52,7 @@ def test_pose_is_the_matrix_as_it_is(root: Path) -> None:
     np.testing.assert_allclose(frame.position_m, [2, 12, 0])
     np.testing.assert_allclose(frame.quat_wxyz, [0.5**0.5, 0, 0, 0.5**0.5], atol=1e-7)
     assert frame.position_m.dtype == frame.quat_wxyz.dtype == np.float64
-    assert frame.intrinsics == Intrinsics(525, 525, 320, 240)
+    assert frame.intrinsics == Intrinsics(525, 525, 320, 240, size=(640, 480))
 
 
 def test_accepts_jpeg(tmp_path: Path) -> None:

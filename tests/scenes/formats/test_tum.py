@@ -35,7 +35,9 @@ def test_pose_and_order_of_the_quaternion(tmp_path: Path) -> None:
     np.testing.assert_allclose(frame.position_m, [1, 2, 3])
     np.testing.assert_allclose(frame.quat_wxyz, [0.7, 0.7 / 7, 0.7 / 7, 0.7])
     assert (frame.sequence, frame.index, frame.timestamp) == (root.name, 0, 100.0)
-    assert frame.intrinsics == Intrinsics(517.3, 516.5, 318.6, 255.3)
+    assert frame.intrinsics == Intrinsics(
+        517.3, 516.5, 318.6, 255.3, (640, 480), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)
+    )
     np.testing.assert_allclose([f.quat_wxyz[0] for f in scene.frames[1:]], 1)
     assert (scene.name, scene.format) == (root.name, "tum")
 

@@ -1,0 +1,162 @@
+"""Whether a dataset's poses fit its images: what `check` proves from matches between nearby frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from lightning_pose.errors import ImageError
+from lightning_pose.features.surf import SURF
+from lightning_pose.geometry.triangulation import find_two_view_depths
+from lightning_pose.mapping.conventions import AS_READ, Reading, rank_readings
+from lightning_pose.mapping.frame_matches import FrameMatches, match_nearby_frames
+from lightning_pose.scenes.images import read_gray
+from lightning_pose.scenes.scene import Scene
+
+__all__ = ["PoseCheck", "check_poses"]
+
+LONGEST_PX = 960
+"""Larger images are shrunk to this before features are extracted."""
+
+MIN_PAIRS = 10
+"""Fewer pairs of frames with a baseline prove nothing."""
+
+BETTER = 0.5
+"""Another reading is proposed if its cost is below this share of the files' own."""
+
+FITS = 0.004
+"""Poses fit the images if the median match lies this near to its epipolar line, in widths of an image: 2.6 px of 640."""
+
+FOCAL_TOLERANCE = 0.1
+"""A known focal length farther than this share from the fitted one is reported."""
+
+PLAUSIBLE_DEPTH_M = (0.05, 300.0)
+"""Median distance of what the cameras see, where positions are in metres."""
+
+MIN_PARALLAX_DEG = 0.5
+"""Rays of a match must differ by this much for its depth to count."""
+
+
+@dataclass
+class PoseCheck:
+    """What matches between nearby frames prove.
+
+    Attributes:
+        facts: by their names, for an overview.
+        errors: what spoils a training.
+        warnings: what may be meant.
+        readings: all readings of the poses, best first; empty where too little could be matched.
+        focal_px: the focal length that fits best, in pixels of the images as they are; nan if unknown.
+    """
+
+    facts: dict[str, str] = field(default_factory=dict)
+    errors: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    readings: list[Reading] = field(default_factory=list)
+    focal_px: float = np.nan
+
+
+def check_poses(scene: Scene) -> PoseCheck:
+    """Match nearby frames, and see under which reading of the poses the matches lie on epipolar lines.
+
+    Images that cannot be read are passed over.
+
+    Args:
+        scene: the dataset, as it was read.
+    """
+    extractor, found = SURF(300), PoseCheck()
+    scales: list[float] = []
+    sizes: list[tuple[int, int]] = []
+    counts: list[int] = []
+
+    def read_keypoints(frame: int) -> tuple[np.ndarray, np.ndarray]:
+        try:
+            image = read_gray(scene.frames[frame].image)
+        except ImageError:
+            return np.zeros((0, 2)), np.zeros((0, 64), np.float32)
+        size = image.shape[1], image.shape[0]
+        scale = min(1.0, LONGEST_PX / max(size))
+        if scale < 1:
+            image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        (record,) = extractor.extract([image])
+        count = int(record["count"])
+        scales.append(scale)
+        sizes.append(size)
+        counts.append(min(count, 300))
+        centre = (record["image_size"] - 1) / 2
+        return record["keypoints"][:count, :2] - centre, record["descriptors"][:count]
+
+    matches = match_nearby_frames([frame.sequence for frame in scene.frames], read_keypoints)
+    if counts:
+        found.facts["features per frame"] = f"median {np.median(counts):.0f} of at most 300 SURF keypoints"
+    quats = np.array([frame.quat_wxyz for frame in scene.frames])
+    rotation = Rotation.from_quat(quats, scalar_first=True).as_matrix()
+    position = np.array([frame.position_m for frame in scene.frames])
+    moved = np.linalg.norm(position[matches.frame_a] - position[matches.frame_b], axis=1) > 0
+    if moved.sum() < MIN_PAIRS:
+        found.facts["poses and images"] = f"not compared: only {moved.sum()} pairs of frames match and move"
+        return found
+    found.readings = rank_readings(matches, rotation, position, max(sizes[0]) * scales[0])
+    _judge_readings(found, scales[0], len(matches.pair), FITS * max(sizes[0]) * scales[0])
+    _judge_focal_length(found, scene, sizes[0])
+    _judge_depth(found, scene, matches, rotation, position, found.focal_px * scales[0])
+    return found
+
+
+def _judge_readings(found: PoseCheck, scale: float, n_matches: int, fits_px: float) -> None:
+    as_read = next(reading for reading in found.readings if reading.name == AS_READ)
+    best = found.readings[0]
+    found.focal_px = best.focal_px / scale
+    others = [reading for reading in found.readings if reading.name != AS_READ]
+    found.facts["poses and images"] = (
+        f"{n_matches} matches lie {as_read.residual_px / scale:.2f} px (median) off their epipolar lines; "
+        f"the next best reading, {others[0].name}: {others[0].residual_px / scale:.2f} px"
+    )
+    if best is not as_read and best.cost < BETTER * as_read.cost and best.residual_px < fits_px:
+        found.errors.append(
+            f"the poses fit the images far better if the files hold: {best.name} ({best.residual_px / scale:.2f} px "
+            f"against {as_read.residual_px / scale:.2f} px as read); convert the pose files, or set data.format"
+        )
+    elif as_read.residual_px > fits_px:
+        found.warnings.append(
+            f"the poses do not fit the images under any usual convention (at best {best.residual_px / scale:.2f} px, "
+            f"read as: {best.name}); check that each image has its own pose, and the clock of the poses"
+        )
+
+
+def _judge_focal_length(found: PoseCheck, scene: Scene, size: tuple[int, int]) -> None:
+    known = scene.frames[0].intrinsics
+    known = None if known is None else known.for_size(*size)
+    about = f"{found.focal_px:.0f} px fits the poses best"
+    found.facts["focal length"] = about if known is None else f"{about}; the dataset has {known.fx:.0f} px"
+    if known is not None and not found.errors and abs(found.focal_px / known.fx - 1) > FOCAL_TOLERANCE:
+        found.warnings.append(
+            f"the dataset's focal length is {known.fx:.0f} px, and {about}; check the calibration and the image size"
+        )
+
+
+def _judge_depth(
+    found: PoseCheck, scene: Scene, matches: FrameMatches, rotation: np.ndarray, position: np.ndarray, focal_px: float
+) -> None:
+    """The distance of what the cameras see, which shows a wrong unit of the positions."""
+    a, b = matches.frame_a[matches.pair], matches.frame_b[matches.pair]
+    to_a = np.swapaxes(rotation[a], 1, 2)
+    turn, shift = to_a @ rotation[b], np.einsum("mij,mj->mi", to_a, position[b] - position[a])
+    points_a, points_b = matches.points_a_px / focal_px, matches.points_b_px / focal_px
+    depth = find_two_view_depths(points_a, points_b, turn, shift)
+    baseline = np.linalg.norm(shift, axis=1)
+    clear = (depth > 0) & (baseline > np.radians(MIN_PARALLAX_DEG) * depth)
+    if clear.sum() < MIN_PAIRS or found.errors:
+        return
+    median = float(np.median(depth[clear]))
+    found.facts["distance of what is seen"] = f"median {median:.3g} {scene.unit}"
+    low, high = PLAUSIBLE_DEPTH_M
+    if scene.unit == "m" and not low <= median <= high:
+        unit = "millimetres" if median > high else "kilometres, or scaled"
+        found.warnings.append(
+            f"the cameras see things at {median:.3g} m (median), which is implausible; if the positions are in "
+            f"{unit}, convert them to metres, or errors in metres mean nothing"
+        )

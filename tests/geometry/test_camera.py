@@ -1,0 +1,59 @@
+"""Cameras: pixels of known rays, through every model."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from lightning_pose.geometry.camera import CAMERA_MODELS, Camera
+
+RAYS = np.random.default_rng(0).uniform([-0.5, -0.4], [0.5, 0.4], (60, 2))
+
+EXAMPLES = {
+    "SIMPLE_PINHOLE": "500,319.5,239.5",
+    "PINHOLE": "500,510,319.5,239.5",
+    "SIMPLE_RADIAL": "500,319.5,239.5,-0.1",
+    "RADIAL": "500,319.5,239.5,-0.1,0.03",
+    "OPENCV": "500,510,319.5,239.5,-0.1,0.03,0.002,-0.001",
+    "FULL_OPENCV": "517.3,516.5,318.6,255.3,0.2624,-0.9531,-0.0054,0.0026,1.1633,0.01,-0.02,0.03",
+    "SIMPLE_RADIAL_FISHEYE": "300,319.5,239.5,0.05",
+    "RADIAL_FISHEYE": "300,319.5,239.5,0.05,-0.01",
+    "OPENCV_FISHEYE": "300,310,319.5,239.5,0.05,-0.01,0.002,0.001",
+}
+
+
+def project(camera: Camera) -> np.ndarray:
+    """Pixels of the rays, by OpenCV."""
+    matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    points = np.column_stack([RAYS, np.ones(len(RAYS))])
+    if camera.fisheye:
+        pixels, _ = cv2.fisheye.projectPoints(
+            points[:, None], np.zeros(3), np.zeros(3), matrix, np.array(camera.distortion)
+        )
+    else:
+        distortion = np.array(camera.distortion) if camera.distortion else None
+        pixels, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, distortion)
+    return pixels.reshape(-1, 2)
+
+
+@pytest.mark.parametrize("model", CAMERA_MODELS)
+def test_pixels_of_known_rays_give_the_rays_back(model: str) -> None:
+    camera = Camera.parse(f"{model},640,480,{EXAMPLES[model]}")
+    np.testing.assert_allclose(camera.normalize(project(camera)), RAYS, atol=1e-9)
+
+
+def test_a_resized_image_shows_the_same_rays() -> None:
+    camera = Camera.parse(f"OPENCV,640,480,{EXAMPLES['OPENCV']}")
+    pixels = project(camera)
+    half = camera.resize(320, 240)
+    np.testing.assert_allclose(half.normalize((pixels + 0.5) / 2 - 0.5), RAYS, atol=1e-9)
+    np.testing.assert_allclose(half.half_view, camera.half_view)
+
+
+def test_lower_case_and_spaces_are_read() -> None:
+    assert Camera.parse(" pinhole, 640, 480, 500, 500, 320, 240 ") == Camera.parse("PINHOLE,640,480,500,500,320,240")
+
+
+def test_no_pixels_give_no_rays() -> None:
+    assert Camera.parse("OPENCV,640,480," + EXAMPLES["OPENCV"]).normalize(np.zeros((0, 2))).shape == (0, 2)

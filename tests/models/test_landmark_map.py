@@ -1,0 +1,116 @@
+"""LandmarkMap as an architecture: cameras, refusals, checkpoints, and what a test says of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from lightning import Trainer
+
+from lightning_pose.checkpoint import build_object
+from lightning_pose.errors import ConfigError, DataError
+from lightning_pose.evaluation.maps import evaluate_map
+from lightning_pose.features import SURF
+from lightning_pose.geometry.quaternions import position_error_m
+from lightning_pose.metrics import catalog
+from lightning_pose.models import LandmarkMap
+from tests.models.helpers import WALL_KEYPOINTS, WallProblem
+
+CAMERA = "PINHOLE,640,480,500,500,319.5,239.5"
+
+
+def fit_wall(problem: WallProblem | None = None, **settings: object) -> tuple[LandmarkMap, WallProblem]:
+    problem = problem or WallProblem([WALL_KEYPOINTS, 36], count=30)
+    model = LandmarkMap(**{"input_shape": [WALL_KEYPOINTS, 36], "bundle_adjust": False, **settings})  # type: ignore[arg-type]
+    trainer = Trainer(
+        max_epochs=1, accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False,
+        enable_model_summary=False,
+    )  # fmt: skip
+    trainer.fit(model, datamodule=problem)
+    return model.eval(), problem
+
+
+@pytest.fixture(scope="module")
+def fitted() -> tuple[LandmarkMap, WallProblem]:
+    return fit_wall(camera=CAMERA)
+
+
+def test_test_frames_are_located_to_a_centimetre(fitted: tuple[LandmarkMap, WallProblem]) -> None:
+    model, problem = fitted
+    data = problem.dataset("test").data
+    assert position_error_m(model(data.features).position_m, data.position_m).median() < 0.01
+
+
+def test_without_a_camera_the_focal_length_is_found(fitted: tuple[LandmarkMap, WallProblem]) -> None:
+    model, problem = fit_wall()
+    assert model.network.view.focal_px == pytest.approx(500, rel=0.03)
+    data = problem.dataset("test").data
+    assert position_error_m(model(data.features).position_m, data.position_m).median() < 0.03
+
+
+def test_a_camera_of_other_images_is_scaled() -> None:
+    model, _ = fit_wall(camera="PINHOLE,1280,960,1000,1000,639.5,479.5")
+    view = model.network.view
+    np.testing.assert_allclose([view.width, view.fx, view.cx, view.cy], [640, 500, 319.5, 239.5])
+
+
+def test_a_checkpoint_holds_the_map(fitted: tuple[LandmarkMap, WallProblem]) -> None:
+    model, problem = fitted
+    rebuilt: LandmarkMap = build_object(model.describe())
+    rebuilt.load_state_dict(model.state_dict())
+    features = problem.dataset("test").data.features[:3]
+    torch.testing.assert_close(rebuilt.eval()(features), model(features), rtol=0, atol=0)
+    assert sum(value.nbytes for value in model.state_dict().values()) < 300_000
+
+
+def test_answers_are_accepted_with_a_radius_or_refused_with_a_reason(fitted: tuple[LandmarkMap, WallProblem]) -> None:
+    model, problem = fitted
+    features = problem.dataset("test").data.features[:2].clone()
+    features[1] = 0
+    answers = model.network.locate(features)
+    radius_m, radius_deg = model.network.find_radii(answers)
+    assert [answer.accepted for answer in answers] == [True, False]
+    assert answers[1].reason == "too few features: 0"
+    assert 0 < radius_m[0] < 0.1
+    assert 0 < radius_deg[0] < 1
+    assert radius_m[1] == np.inf
+
+
+def test_a_test_says_what_the_map_accepts_and_how_well_it_knows(fitted: tuple[LandmarkMap, WallProblem]) -> None:
+    found = evaluate_map(*fitted)
+    assert found.metrics.keys() == {f"test/{name}" for name in catalog.MAP}
+    assert found.metrics["test/accepted"] == 1.0
+    assert found.metrics["test/coverage_position"] > 0.6
+    assert found.figures.keys() == {"map", "error_vs_inliers", "calibration"}
+    assert list(found.rows) == ["of these 100% accepted"]
+
+
+def test_features_without_places_are_refused() -> None:
+    problem = WallProblem([WALL_KEYPOINTS, 36])
+    problem.extractor = SURF(WALL_KEYPOINTS)
+    with pytest.raises(ConfigError, match=r"needs keypoints with their places.*with_geometry: true"):
+        fit_wall(problem)
+
+
+def test_frames_of_which_nothing_can_be_triangulated_are_refused() -> None:
+    problem = WallProblem([WALL_KEYPOINTS, 36])
+    frames = problem.scene.frames
+    problem._scene = replace(problem.scene, frames=tuple(replace(f, position_m=np.zeros(3)) for f in frames))
+    with pytest.raises(DataError, match=r"no point of wall could be triangulated from 24 frames.*check"):
+        fit_wall(problem, camera=CAMERA)
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("PINHOLE,640,480,500,500,320", "does not have the form PINHOLE,WIDTH,HEIGHT,FX,FY,CX,CY"),
+        ("LENS,640,480,500", "'LENS' is no camera model; give one of SIMPLE_PINHOLE"),
+        ("PINHOLE,640,480,0,500,320,240", "focal lengths must be above 0"),
+        ("PINHOLE,640,480,a,500,320,240", "does not have the form"),
+    ],
+)
+def test_a_camera_that_is_not_understood_is_refused(text: str, problem: str) -> None:
+    with pytest.raises(ConfigError, match=problem):
+        LandmarkMap(input_shape=[50, 68], camera=text)
