@@ -28,7 +28,7 @@ BETTER = 0.5
 """Another reading is proposed if its cost is below this share of the files' own."""
 
 FITS = 0.004
-"""Poses fit the images if the median match lies this near to its epipolar line, in widths of an image: 2.6 px of 640."""
+"""Poses fit the images if the median match lies this near to its epipolar line, in image widths: 2.6 px of 640."""
 
 FOCAL_TOLERANCE = 0.1
 """A known focal length farther than this share from the fitted one is reported."""
