@@ -12,7 +12,7 @@ from lightning_pose.mapping.build_map import MappedFrames, summarize_tracks, tri
 from lightning_pose.mapping.frames import MapFrames
 from lightning_pose.mapping.map_localizer import MapAnswer, MapLocalizer
 
-__all__ = ["Calibration", "Measured", "calibrate_map", "measure_answers", "measure_frames"]
+__all__ = ["UNKNOWN", "Calibration", "Measured", "calibrate_map", "measure_answers", "measure_frames"]
 
 BLOCKS = 5
 """Parts of the training frames, each consecutive, left out in turn."""
@@ -47,6 +47,10 @@ class Calibration:
     accepted: float
 
 
+UNKNOWN = Calibration(np.nan, np.nan, np.nan, np.nan, 0.0)
+"""Where nothing was left out."""
+
+
 def calibrate_map(mapped: MappedFrames) -> Calibration:
     """Leave out blocks of training frames in turn, and compare the map's answers for them with their given poses.
 
@@ -66,7 +70,7 @@ def calibrate_map(mapped: MappedFrames) -> Calibration:
         frames = mapped.given.select(block[:: max(1, len(block) // FRAMES_PER_BLOCK)])
         found.append(measure_frames(MapLocalizer(point_map, without=block), frames))
     if not found:
-        return Calibration(np.nan, np.nan, np.nan, np.nan, 0.0)
+        return UNKNOWN
     every = Measured(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
     return Calibration(
         _find_quantile((every.position / every.position_sd)[every.accepted]),

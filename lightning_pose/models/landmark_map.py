@@ -16,7 +16,7 @@ from lightning_pose.errors import ConfigError, DataError
 from lightning_pose.features.base import LocalExtractor
 from lightning_pose.geometry.camera import Camera
 from lightning_pose.mapping.build_map import MappedFrames, adjust_mapped, map_frames, summarize_tracks
-from lightning_pose.mapping.calibration import calibrate_map, measure_frames
+from lightning_pose.mapping.calibration import UNKNOWN, calibrate_map, measure_frames
 from lightning_pose.mapping.conventions import fit_focal_length
 from lightning_pose.mapping.frame_matches import match_nearby_frames
 from lightning_pose.mapping.frames import MapFrames
@@ -96,22 +96,27 @@ class LandmarkMap(TrainingMemory, PoseModule):
 
     def training_step(self, batch: PoseBatch, batch_idx: int) -> None:
         if self.trainer.is_last_batch:  # before the validation that closes the epoch
-            self._build(("train",))
+            self._build(("train",), calibrate=not self._refits)
             cast(LightningOptimizer, self.optimizers()).step()
 
     @torch.no_grad()
     def on_train_epoch_end(self) -> None:
         # Validation is over, and checkpoints are not written yet.
         datamodule = scene_datamodule(self.trainer)
-        if self.refit and len(datamodule.scene.splits["val"]):
-            self._build(("train", "val"))
+        if self._refits:
+            self._build(("train", "val"), calibrate=True)
         train = datamodule.dataset("train")
         sample = list(range(0, len(train), max(1, len(train) // 50)))
         self._step(PoseBatch(*(part.to(self.device) for part in train.__getitems__(sample))), "train")
         self.trainer.should_stop = True  # further epochs would find the same
 
-    def _build(self, splits: tuple[str, ...]) -> None:
-        """Build the map of the frames of these splits, and calibrate it.
+    @property
+    def _refits(self) -> bool:
+        """Whether the map is built again with validation frames."""
+        return self.refit and len(scene_datamodule(self.trainer).scene.splits["val"]) > 0
+
+    def _build(self, splits: tuple[str, ...], calibrate: bool) -> None:
+        """Build the map of the frames of these splits; unless it is only to be validated, find its radii too.
 
         Raises:
             DataError: the frames give no point.
@@ -127,18 +132,20 @@ class LandmarkMap(TrainingMemory, PoseModule):
                 f"no point of {datamodule.scene.root} could be triangulated from {len(frames)} frames; "
                 "`python -m lightning_pose check` says whether the poses fit the images"
             )
-        point_map, calibration = summarize_tracks(mapped), calibrate_map(mapped)
+        point_map, calibration = summarize_tracks(mapped), calibrate_map(mapped) if calibrate else UNKNOWN
         self.network.set_map(point_map, camera, calibration)
-        _log.info(
-            "map of %s frames: %s points, %.1f MB, bundle adjustment %s; training frames left out: %.3g %s, %.2f deg",
-            len(frames),
-            len(point_map),
-            point_map.n_bytes / 1e6,
-            "on" if self._adjusts else "off",
-            calibration.position_error,
-            datamodule.scene.unit,
-            calibration.orientation_error_deg,
-        )
+        if calibrate:
+            _log.info(
+                "map of %d frames: %d points, %.1f MB, bundle adjustment %s; training frames left out in turn are "
+                "located to %.3g %s and %.2f degrees (median)",
+                len(frames),
+                len(point_map),
+                point_map.n_bytes / 1e6,
+                "on" if self._adjusts else "off",
+                calibration.position_error,
+                datamodule.scene.unit,
+                calibration.orientation_error_deg,
+            )
 
     def _choose_adjusted(
         self, mapped: MappedFrames, datamodule: SceneDataModule, camera: Camera, decided: bool
