@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lightning_pose.errors import DataError, ImageError
+from lightning_pose.errors import DataError
 from lightning_pose.scenes.formats import load_scene
 from tests.data.helpers import make_image
 
@@ -90,7 +90,7 @@ def test_empty_list_is_refused(tmp_path: Path) -> None:
 def test_missing_image_is_named(tmp_path: Path) -> None:
     write(tmp_path, TRAIN, TEST)
     (tmp_path / "seq2" / "frame00003.png").unlink()
-    with pytest.raises(ImageError, match=r"frame00003.png is missing, listed in .*\(1 such images\); unpack"):
+    with pytest.raises(DataError, match=r"1 of 4 frames.*frame00003.png is missing, listed in .*; unpack"):
         load_scene(tmp_path)
 
 
