@@ -114,7 +114,7 @@ def _find_trajectory(root: Path) -> Path | None:
     ours = find_file(root, "groundtruth.txt")
     if published:
         return published[0]
-    return ours if ours.is_file() and is_numbered(ours) else None
+    return ours if ours.is_file() and is_numbered(root) else None
 
 
 def _find_images(root: Path) -> dict[int, Path]:

@@ -171,7 +171,7 @@ def _part_header(lines: list[tuple[int, str]]) -> tuple[list[str], list[tuple[in
 
 def _list_column_names(line: str) -> list[list[str]]:
     """The words of a header line without units in brackets, and likewise from the time on."""
-    line = re.sub(r"[\[(]\s*\S*?\s*[\])]", "", line.lstrip("# "))
+    line = re.sub(r"[\[(][^\])]{0,12}[\])]", "", line.lstrip("# "))
     words = [word for word in re.split(r"[\s,;:\[\]()]+", line) if word]
     starts = [i for i, word in enumerate(words) if _find_standard_name(word) == "timestamp"]
     return [words, *(words[start:] for start in starts)]

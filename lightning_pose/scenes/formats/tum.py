@@ -20,7 +20,7 @@ from lightning_pose.scenes.formats.image_files import (
     warn_of_unlisted_images,
 )
 from lightning_pose.scenes.formats.poses import check_quats
-from lightning_pose.scenes.formats.text_files import NumberTable, find_file, read_lines, read_table
+from lightning_pose.scenes.formats.text_files import NumberTable, find_file, list_files, read_lines, read_table
 from lightning_pose.scenes.scene import Frame, Intrinsics, Scene
 
 __all__ = ["FORMAT", "TRAJECTORY_COLUMNS", "Tum", "is_numbered", "pair_by_time"]
@@ -51,10 +51,8 @@ class Tum(SceneFormat):
     looks_for = "rgb.txt and groundtruth.txt"
 
     def matches(self, root: Path) -> bool:
-        trajectory = find_file(root, "groundtruth.txt")
-        if not (find_file(root, "rgb.txt").is_file() and trajectory.is_file()):
-            return False
-        return not ((root / "rgb").is_dir() and is_numbered(trajectory))  # that is ICL-NUIM
+        files = [find_file(root, name) for name in ("rgb.txt", "groundtruth.txt")]
+        return all(file.is_file() for file in files) and not is_numbered(root)
 
     def read(self, root: Path) -> Scene:
         listed = _read_image_list(root, find_file(root, "rgb.txt"))
@@ -121,9 +119,15 @@ def pair_by_time(times: np.ndarray, pose_times: np.ndarray) -> np.ndarray:
     return np.array(sorted(pose_of.items()), dtype=int).reshape(-1, 2)
 
 
-def is_numbered(trajectory: Path) -> bool:
-    """Whether the first column counts frames (0, 1, 2, ... or 1, 2, 3, ..., also as 0.0, 1.0, ...) and has no times."""
-    numbers = read_table(trajectory, TRAJECTORY_COLUMNS).values[:, 0]
+def is_numbered(root: Path) -> bool:
+    """Whether `groundtruth.txt` counts frames (0, 1, 2, ... or 1.0, 2.0, 3.0, ...) and the images are `rgb/N.png`.
+
+    Such a folder is read as ICL-NUIM.
+    """
+    images = root / "rgb"
+    if not images.is_dir() or not any(path.stem.isdecimal() for path in list_files(images)):
+        return False
+    numbers = read_table(find_file(root, "groundtruth.txt"), TRAJECTORY_COLUMNS).values[:, 0]
     return len(numbers) > 0 and numbers[0] in (0, 1) and bool((numbers == numbers[0] + np.arange(len(numbers))).all())
 
 
