@@ -5,11 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import track
 from rich.table import Table
 
 from lightning_pose.commands.parser import VerbParser
 from lightning_pose.scenes.formats import known_formats, load_scene
+from lightning_pose.scenes.formats.base import describe_bad_frames
 from lightning_pose.scenes.inspect import (
     ImageFile,
     count_sequence_frames,
@@ -34,13 +36,14 @@ def main(argv: list[str]) -> int:
     """
     args = _build_check_parser().parse_args(argv)
     console = Console()
-    scene = load_scene(args.dir, args.format)
+    scene = load_scene(args.dir, args.format, on_bad_frame="list")
     reading = track(read_image_files(scene), "reading images", len(scene.frames), console=console, transient=True)
     files = list(reading)
     console.print(_make_overview(scene, files))
     console.print(_make_sequence_table(scene))
     in_images, in_poses = inspect_images(scene, files), inspect_poses(scene)
-    errors, warnings = in_images.errors + in_poses.errors, in_images.warnings + in_poses.warnings
+    errors = _describe_drop(scene) + in_images.errors + in_poses.errors
+    warnings = in_images.warnings + in_poses.warnings
     for kind, texts in (("error", errors), ("warning", warnings)):
         for text in texts:
             console.print(f"{kind}: {text}", markup=False, highlight=False, soft_wrap=True)
@@ -49,8 +52,19 @@ def main(argv: list[str]) -> int:
     return 2 if errors else 0
 
 
+def _describe_drop(scene: Scene) -> list[str]:
+    """The frames that cannot be used, and what `on_bad_frame: drop` would leave; nothing if all can be used."""
+    if not scene.bad_frames:
+        return []
+    left = ", ".join(f"{split} {len(scene.splits[split])}" for split in SPLITS)
+    return [
+        f"{describe_bad_frames(scene)}; data.on_bad_frame: drop leaves them out, "
+        f"and {len(scene.frames)} frames are left ({left})"
+    ]
+
+
 def _make_overview(scene: Scene, files: list[ImageFile]) -> Table:
-    table = Table(title=f"{scene.name}: {len(scene.frames)} frames", show_header=False, title_justify="left")
+    table = Table(title=f"{escape(scene.name)}: {len(scene.frames)} frames", show_header=False, title_justify="left")
     for name, value in describe_scene(scene, files).items():
         table.add_row(name, value)
     return table
@@ -62,7 +76,7 @@ def _make_sequence_table(scene: Scene) -> Table:
         table.add_column(name, justify="right")
     for sequence in count_sequence_frames(scene):
         numbers = (*sequence.counts.values(), sequence.first, sequence.last)
-        table.add_row(sequence.name, *map(str, numbers))
+        table.add_row(escape(sequence.name), *map(str, numbers))
     return table
 
 

@@ -127,7 +127,7 @@ def test_other_units_of_time_are_converted(
     with caplog.at_level(logging.WARNING, "lightning_pose"):
         scene = load_scene(tmp_path)
     assert f"rgb.txt: the times are read as {unit}" in caplog.text
-    np.testing.assert_allclose([f.timestamp for f in scene.frames], times, atol=1e-5, rtol=0)
+    np.testing.assert_allclose(np.array([f.timestamp for f in scene.frames], float), times, atol=1e-5, rtol=0)
     np.testing.assert_allclose([f.position_m[0] for f in scene.frames], range(5))
 
 
