@@ -182,7 +182,7 @@ def _describe_kinds(scene: Scene, facts: list[ImageFacts | None]) -> list[str]:
 
 
 def inspect_poses(scene: Scene) -> Findings:
-    """Find jumps between neighbouring frames, and a camera that never moves."""
+    """Find jumps between neighbouring frames, a camera that never moves, and poses written where tracking was lost."""
     step, angle_deg, neighbours = _measure_steps(scene)
     if not len(step):
         return Findings([], [])
@@ -198,7 +198,25 @@ def inspect_poses(scene: Scene) -> Findings:
         for k, i in enumerate(neighbours)
         if far[k] or turned[k]
     ]
-    return Findings([], _limit_findings(jumps, "jumps"))
+    return Findings([], _limit_findings(jumps, "jumps") + _find_lost_poses(scene))
+
+
+def _find_lost_poses(scene: Scene) -> list[str]:
+    """A warning if frames after the start of their sequence have exactly the origin and no rotation."""
+    identity = (_stack_positions(scene) == 0).all(axis=1) & (_stack_quats(scene) == [1, 0, 0, 0]).all(axis=1)
+    started: set[str] = set()
+    lost = []
+    for frame, at_origin in zip(scene.frames, identity, strict=True):
+        if at_origin and frame.sequence in started:
+            lost.append(frame)
+        elif not at_origin:
+            started.add(frame.sequence)
+    if len(lost) < 2:
+        return []
+    return [
+        f"{len(lost)} poses are exactly at the origin without rotation, as some programs write where tracking was lost, "
+        f"such as that of {lost[0].image}; remove these frames"
+    ]
 
 
 def _read_image_file(path: Path) -> ImageFile:

@@ -175,3 +175,13 @@ def test_exif_orientation_is_warned_of(scene: Scene) -> None:
     (warning,) = inspect_images(scene, list(read_image_files(scene))).warnings
     assert f"2 of 5 images have an EXIF orientation (orientation 6), such as {scene.frames[1].image}" in warning
     assert "refer to the pixels as stored" in warning
+
+
+@pytest.mark.parametrize(("x_m", "count"), [((1, 0, 0, 0, 2), 2), ((0, 0, 1, 0, 2), 0), ((0, 0, 0, 1, 2), 0)])
+def test_poses_at_the_origin_are_counted(x_m: Sequence[float], count: int, tmp_path: Path) -> None:
+    """The third case has them at the start of the sequence, where they are right. Frame 3 begins a sequence."""
+    scene = make_scene(tmp_path, x_m, [0] * 5)
+    frames = [replace(frame, position_m=frame.position_m * [1, 1, 0]) for frame in scene.frames]
+    warnings = inspect_poses(replace(scene, frames=tuple(frames))).warnings
+    found = [text for text in warnings if "exactly at the origin" in text]
+    assert [text.split()[0] for text in found] == ([str(count)] if count else [])

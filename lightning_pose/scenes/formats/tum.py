@@ -60,6 +60,7 @@ class Tum(SceneFormat):
         table = read_table(trajectory, TRAJECTORY_COLUMNS)
         _warn_of_rows_without_time(trajectory, table)
         pose_times = _convert_to_seconds(table.values[:, 0], table.header, trajectory)
+        _warn_of_equal_times(trajectory, pose_times)
         pairs = pair_by_time(listed.times, pose_times)
         if not len(pairs):
             raise DataError(
@@ -197,6 +198,13 @@ def _warn_of_rows_without_time(path: Path, table: NumberTable) -> None:
         log.warning(
             "%s: %d lines have no time and are not used, such as %s", path, len(without), table.places[without[0]]
         )
+
+
+def _warn_of_equal_times(path: Path, times: np.ndarray) -> None:
+    """Log a warning if most lines of a trajectory have the time of another line."""
+    different = len(np.unique(times[np.isfinite(times)]))
+    if 2 * different < len(times):
+        log.warning("%s: %d lines have %d different times; write times with all digits", path, len(times), different)
 
 
 def _format_span(times: np.ndarray) -> str:

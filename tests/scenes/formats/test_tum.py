@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lightning_pose.errors import DataError
+from lightning_pose.errors import ConfigError, DataError
 from lightning_pose.scenes.formats import load_scene
 from lightning_pose.scenes.formats.tum import pair_by_time
 from lightning_pose.scenes.scene import Intrinsics
@@ -167,6 +167,13 @@ def test_lines_gone_from_the_image_list_are_counted(tmp_path: Path, caplog: pyte
     with caplog.at_level(logging.WARNING, "lightning_pose"):
         load_scene(tmp_path)
     assert "1 of 4 images are not in rgb.txt" in caplog.text
+
+
+def test_times_without_their_last_digits_are_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write(tmp_path, [1600000000 + 0.1 * i for i in range(9)], [f"1.600000e+09 {i} 0 0 0 0 0 1" for i in range(9)])
+    with caplog.at_level(logging.WARNING, "lightning_pose"), pytest.raises(ConfigError, match="leaves none"):
+        load_scene(tmp_path)
+    assert "groundtruth.txt: 9 lines have 1 different times; write times with all digits" in caplog.text
 
 
 def test_frame_numbers_and_images_in_another_folder(tmp_path: Path) -> None:
