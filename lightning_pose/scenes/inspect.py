@@ -214,8 +214,8 @@ def _find_lost_poses(scene: Scene) -> list[str]:
     if len(lost) < 2:
         return []
     return [
-        f"{len(lost)} poses are exactly at the origin without rotation, as some programs write where tracking was lost, "
-        f"such as that of {lost[0].image}; remove these frames"
+        f"{len(lost)} poses are exactly at the origin without rotation, as some programs write where tracking was "
+        f"lost, such as that of {lost[0].image}; remove these frames"
     ]
 
 

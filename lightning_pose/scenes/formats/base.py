@@ -15,6 +15,9 @@ __all__ = ["SceneFormat", "describe_bad_frames", "keep_usable"]
 NAMED_FRAMES = 3
 """How many unusable frames a message names; of the others it says only how many there are."""
 
+LONGEST_FAULT = 600
+"""Characters of a text about one frame; names and numbers may have thousands."""
+
 
 class SceneFormat(ABC):
     """Reads one layout of posed images; no other code depends on how it is stored on disk.
@@ -77,5 +80,10 @@ def describe_bad_frames(scene: Scene) -> str:
     """How many of a scene's frames cannot be used, and the first of them."""
     bad = scene.bad_frames
     more = [f"and {len(bad) - NAMED_FRAMES} more"] if len(bad) > NAMED_FRAMES else []
-    named = "; ".join([*bad[:NAMED_FRAMES], *more])
+    named = "; ".join([*map(_shorten, bad[:NAMED_FRAMES]), *more])
     return f"{len(bad)} of {len(scene.frames) + len(bad)} frames cannot be used: {named}"
+
+
+def _shorten(text: str) -> str:
+    """A text without its middle if it is too long to read."""
+    return text if len(text) <= LONGEST_FAULT else f"{text[: LONGEST_FAULT // 2]}...{text[-LONGEST_FAULT // 2 :]}"

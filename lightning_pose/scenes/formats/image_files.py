@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
@@ -210,7 +211,7 @@ def warn_of_unlisted_images(listed: Iterable[Path], list_name: str) -> None:
     for path in listed:
         stems.setdefault(path.parent, set()).add(path.stem.lower())
     for folder, known in stems.items():
-        if not folder.is_dir():
+        if not os.path.isdir(folder):  # a name that no folder can have is no error here, unlike with Path
             continue
         images = [path for path in list_files(folder) if has_image_suffix(path.name)]
         left = [path for path in images if path.stem.lower() not in known and _find_kind(path.name) != "depth"]
