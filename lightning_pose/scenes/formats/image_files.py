@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
@@ -154,7 +153,7 @@ class ImageFinder:
         yield self._enter(folders), name
         if not folders:
             yield from ((self.root / folder, name) for folder in IMAGE_FOLDERS)
-        elif not self._enter(folders[:1]).is_dir():  # the path of another machine
+        elif not _is_folder(self._enter(folders[:1])):  # the path of another machine
             yield from ((self._enter(folders[i:]), name) for i in range(1, len(parts)))
 
     def _enter(self, folders: Sequence[str]) -> Path:
@@ -211,7 +210,7 @@ def warn_of_unlisted_images(listed: Iterable[Path], list_name: str) -> None:
     for path in listed:
         stems.setdefault(path.parent, set()).add(path.stem.lower())
     for folder, known in stems.items():
-        if not os.path.isdir(folder):  # a name that no folder can have is no error here, unlike with Path
+        if not _is_folder(folder):
             continue
         images = [path for path in list_files(folder) if has_image_suffix(path.name)]
         left = [path for path in images if path.stem.lower() not in known and _find_kind(path.name) != "depth"]
@@ -230,6 +229,14 @@ def is_file(path: Path) -> bool:
     """Whether a file exists; a name that no file can have does not."""
     try:
         return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
+def _is_folder(path: Path) -> bool:
+    """Whether a folder exists; a name that no folder can have does not."""
+    try:
+        return path.is_dir()
     except (OSError, ValueError):
         return False
 
