@@ -6,11 +6,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import track
 from rich.table import Table
 
 from lightning_pose.commands.parser import VerbParser
 from lightning_pose.scenes.formats import known_formats, load_scene
+from lightning_pose.scenes.formats.base import describe_bad_frames
 from lightning_pose.scenes.inspect import (
     ImageFile,
     count_sequence_frames,
@@ -38,7 +40,7 @@ def main(argv: list[str]) -> int:
     """
     args = _build_check_parser().parse_args(argv)
     console = Console()
-    scene = load_scene(args.dir, args.format)
+    scene = load_scene(args.dir, args.format, on_bad_frame="list")
     reading = track(read_image_files(scene), "reading images", len(scene.frames), console=console, transient=True)
     files = list(reading)
     with console.status("matching nearby frames"):
@@ -46,7 +48,7 @@ def main(argv: list[str]) -> int:
     console.print(_make_overview(scene, files, compared.facts))
     console.print(_make_sequence_table(scene))
     in_images, in_poses = inspect_images(scene, files), inspect_poses(scene)
-    errors = in_images.errors + in_poses.errors + compared.errors
+    errors = _describe_drop(scene) + in_images.errors + in_poses.errors + compared.errors
     warnings = in_images.warnings + in_poses.warnings + compared.warnings
     for kind, texts in (("error", errors), ("warning", warnings)):
         for text in texts:
@@ -62,8 +64,19 @@ def _compare_poses(scene: Scene) -> PoseCheck:
     return check_poses(scene)
 
 
+def _describe_drop(scene: Scene) -> list[str]:
+    """The frames that cannot be used, and what `on_bad_frame: drop` would leave; nothing if all can be used."""
+    if not scene.bad_frames:
+        return []
+    left = ", ".join(f"{split} {len(scene.splits[split])}" for split in SPLITS)
+    return [
+        f"{describe_bad_frames(scene)}; data.on_bad_frame: drop leaves them out, "
+        f"and {len(scene.frames)} frames are left ({left})"
+    ]
+
+
 def _make_overview(scene: Scene, files: list[ImageFile], compared: dict[str, str]) -> Table:
-    table = Table(title=f"{scene.name}: {len(scene.frames)} frames", show_header=False, title_justify="left")
+    table = Table(title=f"{escape(scene.name)}: {len(scene.frames)} frames", show_header=False, title_justify="left")
     for name, value in (describe_scene(scene, files) | compared).items():
         table.add_row(name, value)
     return table
@@ -75,7 +88,7 @@ def _make_sequence_table(scene: Scene) -> Table:
         table.add_column(name, justify="right")
     for sequence in count_sequence_frames(scene):
         numbers = (*sequence.counts.values(), sequence.first, sequence.last)
-        table.add_row(sequence.name, *map(str, numbers))
+        table.add_row(escape(sequence.name), *map(str, numbers))
     return table
 
 

@@ -15,7 +15,7 @@ from lightning_pose.errors import ConfigError
 from lightning_pose.features import FeatureExtractor
 from lightning_pose.geometry.relative import RelativeFrame, check_relative_frame
 from lightning_pose.scenes.combine import join_scenes
-from lightning_pose.scenes.formats import load_scene
+from lightning_pose.scenes.formats import OnBadFrame, load_scene
 from lightning_pose.scenes.scene import Scene
 
 __all__ = ["ClipDataModule", "require_clips"]
@@ -55,6 +55,8 @@ class ClipDataModule(SceneDataModule):
         train_rooms: which synthetic rooms to train on, where no scene is given.
         test_rooms: which to test on.
         room_frames: how many frames of each.
+        on_bad_frame: `refuse` a scene with frames whose pose or image is missing or useless, or `drop` these frames and
+            say how many there are.
 
     Raises:
         ConfigError: a number is out of its range, or scenes are named in two ways.
@@ -85,6 +87,7 @@ class ClipDataModule(SceneDataModule):
         train_rooms: list[int] = [0],  # noqa: B006  (never changed; shown as it is in --help)
         test_rooms: list[int] = [1],  # noqa: B006
         room_frames: int = 300,
+        on_bad_frame: OnBadFrame = "refuse",
     ) -> None:
         super().__init__(extractor, batch_size, eval_batch_size, cache_dir, workers)
         check_relative_frame(relative_frame)
@@ -109,6 +112,7 @@ class ClipDataModule(SceneDataModule):
         self.train_rooms = train_rooms
         self.test_rooms = test_rooms
         self.room_frames = room_frames
+        self.on_bad_frame: OnBadFrame = on_bad_frame
 
     def _load_scene(self) -> Scene:
         if self.root is not None:
@@ -124,7 +128,10 @@ class ClipDataModule(SceneDataModule):
         return join_scenes(train, test)
 
     def _load(self, roots: Sequence[str | Path]) -> list[Scene]:
-        return [load_scene(root, self.format, self.val_fraction, val_block=self._shape.span) for root in roots]
+        return [
+            load_scene(root, self.format, self.val_fraction, val_block=self._shape.span, on_bad_frame=self.on_bad_frame)
+            for root in roots
+        ]
 
     def dataset(self, split: str) -> ClipDataset:
         """One of `train`, `val`, `test` as clips, without augmentation."""

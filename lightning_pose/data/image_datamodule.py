@@ -11,7 +11,7 @@ from lightning_pose.data.batches import DrawnDataset, PoseBatch, make_loader
 from lightning_pose.data.datamodule import SceneDataModule, room_folder
 from lightning_pose.errors import ConfigError
 from lightning_pose.features import FeatureCache, FeatureExtractor, LocalExtractor
-from lightning_pose.scenes.formats import load_scene
+from lightning_pose.scenes.formats import OnBadFrame, load_scene
 from lightning_pose.scenes.scene import Scene
 
 __all__ = ["ImageDataModule"]
@@ -34,6 +34,8 @@ class ImageDataModule(SceneDataModule):
         workers: processes or threads that extract features; every core if not given.
         room_seed: which synthetic room.
         room_frames: how many frames of it.
+        on_bad_frame: `refuse` a scene with frames whose pose or image is missing or useless, or `drop` these frames and
+            say how many there are.
 
     Raises:
         ConfigError: a number is out of its range.
@@ -53,6 +55,7 @@ class ImageDataModule(SceneDataModule):
         workers: int | None = None,
         room_seed: int = 0,
         room_frames: int = 300,
+        on_bad_frame: OnBadFrame = "refuse",
     ) -> None:
         super().__init__(extractor, batch_size, eval_batch_size, cache_dir, workers)
         self.root = root
@@ -62,10 +65,11 @@ class ImageDataModule(SceneDataModule):
         self._pool = None if feature_pool is None else _widen_extractor(extractor, feature_pool)
         self.room_seed = room_seed
         self.room_frames = room_frames
+        self.on_bad_frame: OnBadFrame = on_bad_frame
 
     def _load_scene(self) -> Scene:
         root = Path(self.root) if self.root is not None else room_folder(self.room_seed, self.room_frames)
-        return load_scene(root, self.format, self.val_fraction)
+        return load_scene(root, self.format, self.val_fraction, on_bad_frame=self.on_bad_frame)
 
     def train_dataloader(self) -> DataLoader[PoseBatch]:
         train = self.dataset("train")

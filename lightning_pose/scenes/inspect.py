@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from lightning_pose.errors import ImageError
-from lightning_pose.scenes.images import decode_image, read_bytes
+from lightning_pose.scenes.images import ImageFacts, measure_image, read_bytes
 from lightning_pose.scenes.scene import SPLITS, Scene
 
 __all__ = [
@@ -49,11 +49,16 @@ class Findings:
 
 @dataclass(frozen=True)
 class ImageFile:
-    """An image file: digest of its bytes and `WIDTHxHEIGHT` if it can be decoded, otherwise what is wrong with it."""
+    """An image file: digest of its bytes and facts if it can be decoded, otherwise what is wrong with it."""
 
     digest: bytes = b""
-    size: str = ""
+    facts: ImageFacts | None = None
     error: str = ""
+
+    @property
+    def size(self) -> str:
+        """`WIDTHxHEIGHT`, empty if the image cannot be decoded."""
+        return "" if self.facts is None else f"{self.facts.width}x{self.facts.height}"
 
 
 class SequenceFacts(NamedTuple):
@@ -88,6 +93,7 @@ def describe_scene(scene: Scene, files: list[ImageFile]) -> dict[str, str]:
         "format": f"{scene.format}, ground truth {scene.ground_truth}",
         f"split ({scene.split_source})": ", ".join(f"{split} {size}" for split, size in sizes.items()),
         "image size": _format_counts(Counter(file.size for file in files if file.size)) or "none can be read",
+        "image depth": _format_counts(Counter(f"{file.facts.bits} bits" for file in files if file.facts)) or "unknown",
         "intrinsics": "unknown" if camera is None else f"f {camera.fx:g} {camera.fy:g}, c {camera.cx:g} {camera.cy:g}",
         "extent": " x ".join(f"{side:.2f}" for side in np.ptp(positions, axis=0)) + f" {scene.unit}",
     }
@@ -122,7 +128,7 @@ def count_sequence_frames(scene: Scene) -> list[SequenceFacts]:
 
 
 def inspect_images(scene: Scene, files: list[ImageFile]) -> Findings:
-    """Find unreadable images, copies of one image (above all in test and training alike), and mixed sizes.
+    """Find unreadable images, copies of one image (above all in test and training alike), and images of mixed kinds.
 
     Args:
         scene: the dataset.
@@ -148,11 +154,35 @@ def inspect_images(scene: Scene, files: list[ImageFile]) -> Findings:
     sizes = Counter(file.size for file in files if file.size)
     if len(sizes) > 1:
         warnings.append(f"images of {len(sizes)} sizes, {_format_counts(sizes)}; resize them unless the cameras differ")
-    return Findings(_limit_findings(errors, "unreadable images"), warnings)
+    errors = _limit_findings(errors, "unreadable images")
+    warnings += _describe_kinds(scene, [file.facts for file in files])
+    blank = [i for i, file in enumerate(files) if file.facts is not None and file.facts.blank]
+    if blank:
+        text = f"{len(blank)} images have one value in all pixels, such as {scene.frames[blank[0]].image}; remove them"
+        (errors if 2 * len(blank) > len(files) else warnings).append(text)
+    return Findings(errors, warnings)
+
+
+def _describe_kinds(scene: Scene, facts: list[ImageFacts | None]) -> list[str]:
+    """What is to know of images with an EXIF orientation, and of images of less than 16 bits in 16-bit files."""
+    known = [(i, fact) for i, fact in enumerate(facts) if fact is not None]
+    texts = []
+    turned = Counter(f"orientation {fact.orientation}" for _, fact in known if fact.orientation != 1)
+    if turned:
+        first = next(i for i, fact in known if fact.orientation != 1)
+        texts.append(
+            f"{sum(turned.values())} of {len(facts)} images have an EXIF orientation ({_format_counts(turned)}), "
+            f"such as {scene.frames[first].image}; it is ignored, because poses and intrinsics refer to the pixels as "
+            "stored: check that yours do, and give new images likewise"
+        )
+    depths = Counter(f"{fact.bits} bits" for _, fact in known)
+    if len(depths) > 1:
+        texts.append(f"images of {len(depths)} depths, {_format_counts(depths)}; each is scaled to 8 bits by its own")
+    return texts
 
 
 def inspect_poses(scene: Scene) -> Findings:
-    """Find jumps between neighbouring frames, and a camera that never moves."""
+    """Find jumps between neighbouring frames, a camera that never moves, and poses written where tracking was lost."""
     step, angle_deg, neighbours = _measure_steps(scene)
     if not len(step):
         return Findings([], [])
@@ -168,17 +198,35 @@ def inspect_poses(scene: Scene) -> Findings:
         for k, i in enumerate(neighbours)
         if far[k] or turned[k]
     ]
-    return Findings([], _limit_findings(jumps, "jumps"))
+    return Findings([], _limit_findings(jumps, "jumps") + _find_lost_poses(scene))
+
+
+def _find_lost_poses(scene: Scene) -> list[str]:
+    """A warning if frames after the start of their sequence have exactly the origin and no rotation."""
+    identity = (_stack_positions(scene) == 0).all(axis=1) & (_stack_quats(scene) == [1, 0, 0, 0]).all(axis=1)
+    started: set[str] = set()
+    lost = []
+    for frame, at_origin in zip(scene.frames, identity, strict=True):
+        if at_origin and frame.sequence in started:
+            lost.append(frame)
+        elif not at_origin:
+            started.add(frame.sequence)
+    if len(lost) < 2:
+        return []
+    return [
+        f"{len(lost)} poses are exactly at the origin without rotation, as some programs write where tracking was "
+        f"lost, such as that of {lost[0].image}; remove these frames"
+    ]
 
 
 def _read_image_file(path: Path) -> ImageFile:
     """Read and decode an image file."""
     try:
         data = read_bytes(path)
-        height, width = decode_image(data, path, color=False).shape
+        facts = measure_image(data, path)
     except ImageError as error:
         return ImageFile(error=str(error))
-    return ImageFile(hashlib.blake2b(data, digest_size=16).digest(), f"{width}x{height}")
+    return ImageFile(hashlib.blake2b(data, digest_size=16).digest(), facts)
 
 
 def _measure_steps(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

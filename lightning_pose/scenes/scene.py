@@ -79,6 +79,8 @@ class Scene:
             no frame of the test scenes is trained on.
         unit: unit of the positions: `m`, or `scene` if the scale is arbitrary.
         ground_truth: where the poses come from (`original`, `sfm`, `synthetic`, ...).
+        bad_frames: what is wrong with each frame that the dataset lists and that is not in `frames`; each text begins
+            with the file, and the line where there are several.
     """
 
     name: str
@@ -89,3 +91,4 @@ class Scene:
     split_source: str = "official"
     unit: str = "m"
     ground_truth: str = "original"
+    bad_frames: tuple[str, ...] = ()

@@ -95,6 +95,26 @@ def test_camera_that_never_moves_is_an_error(root: Path, capsys: pytest.CaptureF
     assert "error: all 30 positions are [0. 0. 1.]; there is nothing to learn, check" in capsys.readouterr().out
 
 
+def test_bad_frames_are_errors_and_what_drop_leaves_is_said(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for frame in (2, 5, 6, 7):
+        image(root, 1, frame).with_name(f"frame-{frame:06d}.pose.txt").write_text("-inf " * 16)
+    assert main([str(root)]) == 2
+    printed = capsys.readouterr().out
+    assert "error: 4 of 30 frames cannot be used: " in printed
+    assert (
+        "and 1 more; data.on_bad_frame: drop leaves them out, and 26 frames are left (train 14, val 2, test 10)"
+        in printed
+    )
+    assert "usable as it is" not in printed
+
+
+def test_brackets_in_names_are_shown(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    renamed = root.with_name("room[a]")
+    root.rename(renamed)
+    assert main([str(renamed)]) == 0
+    assert "room[a]: 30 frames" in capsys.readouterr().out
+
+
 def test_format_is_forced(root: Path) -> None:
     with pytest.raises(DataError, match="dataset_train"):
         main([str(root), "--format", "cambridge"])

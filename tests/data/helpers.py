@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Mapping
 from pathlib import Path
 
+import cv2
 import numpy as np
 
-__all__ = ["QUARTER_TURN_Z", "REAL_DATA", "make_image", "write_seven_scenes"]
+__all__ = ["QUARTER_TURN_Z", "REAL_DATA", "make_image", "make_turned_jpeg", "write_seven_scenes"]
 
 REAL_DATA = Path(__file__).parents[3] / "shared" / "data"
 """Real datasets beside the checkout, for those who have them; tests that need them are skipped without."""
@@ -21,6 +23,20 @@ def make_image(path: Path) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.touch()
     return path
+
+
+def make_turned_jpeg(pixels: np.ndarray, orientation: int, order: str = "<") -> bytes:
+    """A JPEG file with an EXIF orientation, in either byte order.
+
+    Args:
+        pixels: (H, W) or (H, W, 3) BGR, uint8.
+        orientation: 1 to 8.
+        order: `<` or `>`.
+    """
+    data = cv2.imencode(".jpg", pixels)[1].tobytes()
+    head = {"<": b"II*\0", ">": b"MM\0*"}[order] + struct.pack(f"{order}I", 8)
+    tiff = head + struct.pack(f"{order}HHHIHHI", 1, 0x0112, 3, 1, orientation, 0, 0)
+    return data[:2] + b"\xff\xe1" + struct.pack(">H", len(tiff) + 8) + b"Exif\0\0" + tiff + data[2:]
 
 
 def write_seven_scenes(root: Path, train: Mapping[int, int], test: Mapping[int, int], suffix: str = "png") -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import struct
 import zlib
 from pathlib import Path
@@ -11,7 +12,17 @@ import numpy as np
 import pytest
 
 from lightning_pose.errors import ImageError
-from lightning_pose.scenes.images import decode_image, read_bytes, read_gray, read_rgb, to_gray
+from lightning_pose.scenes.images import (
+    ImageFacts,
+    decode_image,
+    find_bits,
+    measure_image,
+    read_bytes,
+    read_gray,
+    read_rgb,
+    to_gray,
+)
+from tests.data.helpers import make_turned_jpeg
 
 RED, GREEN, BLUE = (255, 0, 0), (0, 255, 0), (0, 0, 255)
 GRAY_OF = {RED: 76, GREEN: 150, BLUE: 29}  # 0.299, 0.587 and 0.114 of 255
@@ -70,6 +81,15 @@ def test_16_bits_are_scaled_by_their_full_range(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_rgb(color), [[[255, 128, 0]]])
 
 
+@pytest.mark.parametrize("bits", [8, 10, 12, 14, 16])
+def test_bits_in_use_are_scaled_to_8(bits: int, tmp_path: Path) -> None:
+    top = (1 << bits) - 1
+    image = np.array([[0, top // 2 + 1, top]], np.uint16)
+    np.testing.assert_array_equal(read_gray(save(tmp_path / "x.png", image)), [[0, 128, 255]])
+    np.testing.assert_array_equal(to_gray(image), [[0, 128, 255]])
+    assert find_bits(image) == bits
+
+
 def test_alpha_is_dropped(tmp_path: Path) -> None:
     path = save(tmp_path / "x.png", np.array([[(*RED, 0), (*GREEN, 128), (*BLUE, 255)]], np.uint8))
     np.testing.assert_array_equal(read_rgb(path), [[RED, GREEN, BLUE]])
@@ -87,17 +107,39 @@ def test_palette(alpha: bytes, tmp_path: Path) -> None:
 @pytest.mark.parametrize("orientation", [3, 6, 8])
 def test_exif_orientation_is_ignored(orientation: int, tmp_path: Path) -> None:
     plain = save(tmp_path / "x.jpg", smooth())
-    data = plain.read_bytes()
-    tiff = b"II*\0\x08\0\0\0" + struct.pack("<HHHIHHI", 1, 0x0112, 3, 1, orientation, 0, 0)
-    exif = b"\xff\xe1" + struct.pack(">H", len(tiff) + 8) + b"Exif\0\0" + tiff
     turned = tmp_path / "turned.jpg"
-    turned.write_bytes(data[:2] + exif + data[2:])
+    turned.write_bytes(make_turned_jpeg(smooth()[..., ::-1], orientation))
     if orientation != 3:  # OpenCV would apply the tag; `decode_image` asks it not to
         honoured = cv2.imread(str(turned))
         assert honoured is not None
         assert honoured.shape == (64, 48, 3)
     np.testing.assert_array_equal(read_gray(turned), read_gray(plain))
     np.testing.assert_array_equal(read_rgb(turned), read_rgb(plain))
+
+
+@pytest.mark.parametrize(("order", "orientation"), [("<", 5), (">", 7)])
+def test_exif_orientation_is_said_once(
+    order: str, orientation: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    paths = [tmp_path / f"{i}.jpg" for i in range(2)]
+    for path in paths:
+        path.write_bytes(make_turned_jpeg(smooth(), orientation, order))
+    with caplog.at_level(logging.WARNING, "lightning_pose"):
+        for path in paths:
+            read_gray(path)
+    assert caplog.text.count("has EXIF orientation") == 1
+    assert (
+        f"{paths[0]} has EXIF orientation {orientation}, which is ignored: poses refer to pixels as stored"
+        in caplog.text
+    )
+    assert measure_image(paths[1].read_bytes(), paths[1]) == ImageFacts(64, 48, 8, orientation, False)
+
+
+def test_damaged_exif_is_no_orientation() -> None:
+    data = make_turned_jpeg(smooth(), 6)
+    cut = data.replace(struct.pack("<HHIHH", 0x0112, 3, 1, 6, 0), struct.pack("<HHIHH", 0x0112, 3, 1, 600, 0))
+    assert measure_image(cut, "x.jpg").orientation == 1
+    assert measure_image(data.replace(b"II*\0\x08", b"II*\0\xff"), "x.jpg").orientation == 1
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp", ".ppm", ".tif", ".webp"])

@@ -19,6 +19,7 @@ from lightning_pose.scenes.inspect import (
     read_image_files,
 )
 from lightning_pose.scenes.scene import Frame, Intrinsics, Scene
+from tests.data.helpers import make_turned_jpeg
 
 
 def turn_z(degrees: float) -> np.ndarray:
@@ -44,7 +45,9 @@ def scene(tmp_path: Path) -> Scene:
     """`make_scene` with five different images of 8 x 6 pixels."""
     scene = make_scene(tmp_path)
     for i, frame in enumerate(scene.frames):
-        cv2.imwrite(str(frame.image), np.full((6, 8, 3), 40 * i, np.uint8))
+        image = np.full((6, 8, 3), 40 * i, np.uint8)
+        image[0, 0] = 255
+        cv2.imwrite(str(frame.image), image)
     return scene
 
 
@@ -53,6 +56,7 @@ def test_facts_by_hand(scene: Scene) -> None:
         "format": "tum, ground truth original",
         "split (blocks)": "train 2, val 1, test 2",
         "image size": "8x6",
+        "image depth": "8 bits",
         "intrinsics": "unknown",
         "extent": "4.00 x 0.00 x 0.00 m",
         # Steps of 1 m and 10 deg in `a`, and of half as much a frame in `b`, whose two frames are numbered 7 and 9.
@@ -125,7 +129,7 @@ def test_copies_are_warned_of_and_those_across_the_split_once_more(scene: Scene)
 
 
 def test_sizes_that_differ_are_counted(scene: Scene) -> None:
-    cv2.imwrite(str(scene.frames[4].image), np.zeros((3, 4, 3), np.uint8))
+    cv2.imwrite(str(scene.frames[4].image), np.eye(3, 4, dtype=np.uint8))
     (warning,) = inspect_images(scene, list(read_image_files(scene))).warnings
     assert warning.startswith("images of 2 sizes, 8x6 (4), 4x3 (1); resize them")
 
@@ -145,3 +149,39 @@ def test_a_turn_of_twenty_medians_is_a_jump_from_30_degrees_on(tmp_path: Path) -
 def test_a_camera_that_never_moves_is_an_error(tmp_path: Path) -> None:
     (error,) = inspect_poses(make_scene(tmp_path, x_m=(2,) * 5)).errors
     assert error.startswith("all 5 positions are [2. 0. 1.]; there is nothing to learn")
+
+
+@pytest.mark.parametrize(("blank", "errors"), [(2, 0), (3, 1)])
+def test_blank_images_are_counted_and_refused_where_most_are(blank: int, errors: int, scene: Scene) -> None:
+    for i in range(blank):
+        cv2.imwrite(str(scene.frames[i].image), np.full((6, 8), 90 + i, np.uint8))
+    findings = inspect_images(scene, list(read_image_files(scene)))
+    assert len(findings.errors) == errors
+    text = f"{blank} images have one value in all pixels, such as {scene.frames[0].image}"
+    assert any(text in line for line in (findings.errors if errors else findings.warnings))
+
+
+def test_mixed_depths_are_warned_of(scene: Scene) -> None:
+    cv2.imwrite(str(scene.frames[2].image), np.array([[0, 4000]], np.uint16).repeat(4, 1).repeat(6, 0))
+    files = list(read_image_files(scene))
+    assert describe_scene(scene, files)["image depth"] == "8 bits (4), 12 bits (1)"
+    (warning,) = inspect_images(scene, files).warnings
+    assert warning.startswith("images of 2 depths, 8 bits (4), 12 bits (1)")
+
+
+def test_exif_orientation_is_warned_of(scene: Scene) -> None:
+    for i in (1, 3):
+        scene.frames[i].image.write_bytes(make_turned_jpeg(np.eye(6, 8, dtype=np.uint8) * (100 + i), 6))
+    (warning,) = inspect_images(scene, list(read_image_files(scene))).warnings
+    assert f"2 of 5 images have an EXIF orientation (orientation 6), such as {scene.frames[1].image}" in warning
+    assert "refer to the pixels as stored" in warning
+
+
+@pytest.mark.parametrize(("x_m", "count"), [((1, 0, 0, 0, 2), 2), ((0, 0, 1, 0, 2), 0), ((0, 0, 0, 1, 2), 0)])
+def test_poses_at_the_origin_are_counted(x_m: Sequence[float], count: int, tmp_path: Path) -> None:
+    """The third case has them at the start of the sequence, where they are right. Frame 3 begins a sequence."""
+    scene = make_scene(tmp_path, x_m, [0] * 5)
+    frames = [replace(frame, position_m=frame.position_m * [1, 1, 0]) for frame in scene.frames]
+    warnings = inspect_poses(replace(scene, frames=tuple(frames))).warnings
+    found = [text for text in warnings if "exactly at the origin" in text]
+    assert [text.split()[0] for text in found] == ([str(count)] if count else [])

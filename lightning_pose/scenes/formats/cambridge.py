@@ -4,13 +4,24 @@ from __future__ import annotations
 
 import logging
 import re
-from pathlib import Path, PurePosixPath
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lightning_pose.errors import DataError
-from lightning_pose.scenes.formats.base import SceneFormat, read_lines, require_images, sort_frames, unit_quats
+from lightning_pose.scenes.formats.base import SceneFormat, keep_usable
+from lightning_pose.scenes.formats.image_files import (
+    ImageFinder,
+    choose_listed_images,
+    has_image_suffix,
+    number_images,
+    warn_of_unlisted_images,
+)
+from lightning_pose.scenes.formats.poses import check_quats
+from lightning_pose.scenes.formats.text_files import find_column_order, find_file, parse_numbers, read_lines
 from lightning_pose.scenes.scene import Frame, Scene
 
 __all__ = ["FORMAT", "Cambridge"]
@@ -18,97 +29,129 @@ __all__ = ["FORMAT", "Cambridge"]
 log = logging.getLogger("lightning_pose")
 
 SPLIT_FILES = {"train": "dataset_train.txt", "test": "dataset_test.txt"}
-HEADER_LINES = 3
+LISTS = " or ".join(SPLIT_FILES.values())
+COLUMNS = ("tx", "ty", "tz", "qw", "qx", "qy", "qz")
 MAX_DISTANCE_M = 10_000.0
 """Poses farther than this from the median position are dropped."""
 
 
 class Cambridge(SceneFormat):
-    """`dataset_train.txt` and `dataset_test.txt`: three header lines, then `image x y z qw qx qy qz`.
+    """`dataset_train.txt` and `dataset_test.txt`: header lines, then `image x y z qw qx qy qz`.
 
-    xyz is the camera centre in the world, metres; the quaternion is world-to-camera, w first, and is
-    inverted here. The image's folder is its sequence. Poses more than 10 km from the median of all
-    positions are errors of the reconstruction; they are dropped with a warning.
+    xyz is the camera centre in the world, metres; the quaternion is world-to-camera, w first unless the header gives
+    another order, and is inverted here. Lines before the first that names an image are the header; there may be none.
+    The image's folder is its sequence. Poses more than 10 km from the median of all positions are errors of the
+    reconstruction; they are dropped with a warning.
     """
 
     name = "cambridge"
     looks_for = "dataset_train.txt and dataset_test.txt"
 
     def matches(self, root: Path) -> bool:
-        return all((root / file).is_file() for file in SPLIT_FILES.values())
+        return all(find_file(root, file).is_file() for file in SPLIT_FILES.values())
 
     def read(self, root: Path) -> Scene:
-        rows = {split: _read_pose_list(root / file) for split, file in SPLIT_FILES.items()}
-        frames, split_of = _make_frames(root, rows)
+        rows = {split: _read_pose_list(find_file(root, file)) for split, file in SPLIT_FILES.items()}
+        frames, faults, split_of = _make_frames(root, rows)
+        kept = _keep_near_median(root, frames, faults)
+        usable, bad = keep_usable([frames[i] for i in kept], [faults[i] for i in kept], LISTS)
         splits = {
-            split: np.array([i for i, frame in enumerate(frames) if split_of[frame.image] == split], dtype=int)
+            split: np.array([i for i, frame in enumerate(usable) if split_of[frame.image] == split], dtype=int)
             for split in SPLIT_FILES
         }
-        for split, file in SPLIT_FILES.items():
-            if not len(splits[split]):
-                raise DataError(f"{root / file} lists no usable frame; the {split} split needs at least one")
-        return Scene(root.resolve().name, root, self.name, frames, splits, ground_truth="sfm")
+        return Scene(root.resolve().name, root, self.name, usable, splits, ground_truth="sfm", bad_frames=bad)
 
 
 FORMAT = Cambridge()
 
-Row = tuple[str, list[float], str]
-"""An image, its seven numbers, and its place in the file."""
+
+class PoseRow(NamedTuple):
+    """A line of a list: the image as listed, the seven numbers of its pose (NaN if unreadable), its place and fault."""
+
+    image: str
+    numbers: np.ndarray
+    place: str
+    fault: str
 
 
-def _read_pose_list(path: Path) -> list[Row]:
+def _read_pose_list(path: Path) -> list[PoseRow]:
     """Read the rows of a split's file."""
-    rows = []
-    for number, line in read_lines(path):
-        if number <= HEADER_LINES:
-            continue
-        image, *items = line.split()
-        try:
-            pose = [float(item) for item in items]
-        except ValueError:
-            pose = []
-        if len(pose) != 7 or not np.isfinite(pose).all():
-            raise DataError(
-                f"{path}:{number}: expected `image x y z qw qx qy qz` after {HEADER_LINES} header lines, "
-                f"found `{line}`; correct the line"
-            )
-        rows.append((image, pose, f"{path}:{number}"))
+    rows: list[PoseRow] = []
+    order = list(range(7))
+    for number, line in read_lines(path, comments=True):
+        row = _parse_pose_row(line, f"{path}:{number}")
+        if line.startswith("#") or (not rows and row.fault and not has_image_suffix(re.split(r"[\s,;]+", line)[0])):
+            words = re.split(r"[\s,;\[\]()]+", line.strip("[]()# "))
+            order = find_column_order(words[-7:], COLUMNS) or order
+        else:
+            rows.append(row._replace(numbers=row.numbers[order]))
+    if not rows:
+        raise DataError(f"{path} lists no usable frame; the {path.stem[8:]} split needs at least one")
     return rows
 
 
-def _make_frames(root: Path, rows: dict[str, list[Row]]) -> tuple[tuple[Frame, ...], dict[Path, str]]:
-    """Make the frames of both lists, sorted, and find the split of each image."""
+def _parse_pose_row(line: str, place: str) -> PoseRow:
+    """Read `image x y z qw qx qy qz`, separated by blanks, tabs or commas; blanks in the image's path are kept."""
+    tokens = re.split(r"([\s,;]+)", line)
+    image = "".join(tokens[:-14]).strip("\"' ")
+    try:
+        numbers = parse_numbers(" ".join(tokens[-13::2]), 7)
+        if not image or not np.isfinite(numbers).all() or (" " in image and not has_image_suffix(image)):
+            raise ValueError(image)
+    except ValueError:
+        fault = f"{place}: expected `image x y z qw qx qy qz`, found `{line[:200]}`; correct the line"
+        return PoseRow(re.split(r"[\s,;]+", line)[0], np.full(7, np.nan), place, fault)
+    return PoseRow(image, numbers, place, "")
+
+
+def _make_frames(root: Path, rows: dict[str, list[PoseRow]]) -> tuple[list[Frame], list[str], dict[Path, str]]:
+    """Make the frames of both lists, with the fault of each, and find the split of each image."""
+    listed = [(split, row) for split, split_rows in rows.items() for row in split_rows]
+    finder = ImageFinder(root)
+    images = [finder.find(row.image) for _, row in listed]
+    finder.warn(LISTS)
+    warn_of_unlisted_images(images, LISTS)
     split_of: dict[Path, str] = {}
-    for split, listed in rows.items():
-        for image, _, place in listed:
-            if root / image in split_of:
-                raise DataError(f"{place}: {image} is listed twice; an image belongs once to one split")
-            split_of[root / image] = split
-    listed = [row for split_rows in rows.values() for row in split_rows]
-    poses = np.array([pose for _, pose, _ in listed]).reshape(-1, 7)
-    quats = unit_quats(poses[:, 3:], [place for *_, place in listed], scalar_first=True)
+    for image, (split, row) in zip(images, listed, strict=True):
+        if image in split_of:
+            raise DataError(f"{row.place}: {row.image} is listed twice; an image belongs once to one split")
+        split_of[image] = split
+    numbers = np.array([row.numbers for _, row in listed])
+    position_m, quats, found = check_quats(numbers[:, :3], numbers[:, 3:], scalar_first=True)
     quats = Rotation.from_quat(quats, scalar_first=True).inv().as_quat(canonical=True, scalar_first=True)
-    kept = _keep_near_median(root, poses[:, :3])
-    frames = [Frame(root / listed[i][0], poses[i, :3], quats[i], *_parse_image_path(root, listed[i][0])) for i in kept]
-    require_images((frame.image for frame in frames), " or ".join(SPLIT_FILES.values()))
-    return sort_frames(frames), split_of
+    sequences = [_find_sequence(root, image) for image in images]
+    indices = _number_frames(sequences, images)
+    read = choose_listed_images(images)
+    chosen = [i for i, image in enumerate(images) if image in read]
+    frames = [Frame(images[i], position_m[i], quats[i], sequences[i], indices[i]) for i in chosen]
+    faults = [listed[i][1].fault or (found[i] and f"{listed[i][1].place}: {found[i]}") for i in chosen]
+    return frames, faults, split_of
 
 
-def _keep_near_median(root: Path, positions_m: np.ndarray) -> np.ndarray:
-    """Rows within MAX_DISTANCE_M of the median position; warn if others are dropped."""
-    if not len(positions_m):
-        return np.array([], dtype=int)
-    distance = np.linalg.norm(positions_m - np.median(positions_m, axis=0), axis=1)
-    kept = np.flatnonzero(distance <= MAX_DISTANCE_M)
-    if len(kept) < len(positions_m):
-        dropped = len(positions_m) - len(kept)
-        log.warning("%s: dropped %d of %d frames, posed more than 10 km off", root, dropped, len(positions_m))
+def _number_frames(sequences: Sequence[str], images: Sequence[Path]) -> list[int]:
+    """The number of each image in its sequence."""
+    indices = [0] * len(images)
+    for sequence in set(sequences):
+        members = [i for i, name in enumerate(sequences) if name == sequence]
+        for i, index in zip(members, number_images([images[i].name for i in members]), strict=True):
+            indices[i] = index
+    return indices
+
+
+def _keep_near_median(root: Path, frames: Sequence[Frame], faults: Sequence[str]) -> list[int]:
+    """Rows with a fault, and those within MAX_DISTANCE_M of the median position; warn if others are dropped."""
+    sound = [frame.position_m for frame, fault in zip(frames, faults, strict=True) if not fault]
+    middle = np.median(sound, axis=0) if sound else np.zeros(3)
+    kept = [
+        i for i, frame in enumerate(frames) if faults[i] or np.linalg.norm(frame.position_m - middle) <= MAX_DISTANCE_M
+    ]
+    if len(kept) < len(frames):
+        dropped = len(frames) - len(kept)
+        log.warning("%s: dropped %d of %d frames, posed more than 10 km off", root, dropped, len(frames))
     return kept
 
 
-def _parse_image_path(root: Path, image: str) -> tuple[str, int]:
-    """Sequence and frame number of an image path: `seq1`, 12 of `seq1/frame00012.png`."""
-    path = PurePosixPath(image)
-    number = re.search(r"\d+", path.stem)
-    folder = path.parent.as_posix()
-    return (root.resolve().name if folder == "." else folder), int(number[0]) if number else 0
+def _find_sequence(root: Path, image: Path) -> str:
+    """The sequence of an image: its folder under the root, or the root's name."""
+    folder = image.parent.relative_to(root).as_posix() if image.is_relative_to(root) else image.parent.as_posix()
+    return root.resolve().name if folder == "." else folder

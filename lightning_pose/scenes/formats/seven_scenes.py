@@ -3,104 +3,122 @@
 from __future__ import annotations
 
 import json
+import logging
 import re
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
 from lightning_pose.errors import DataError
-from lightning_pose.scenes.formats.base import SceneFormat, convert_matrices, read_lines, sort_frames
+from lightning_pose.scenes.formats.base import SceneFormat, keep_usable
+from lightning_pose.scenes.formats.frame_folders import has_posed_frames, read_frame_folder
+from lightning_pose.scenes.formats.text_files import find_file, list_files, read_lines, read_text
 from lightning_pose.scenes.scene import Frame, Intrinsics, Scene
 
 __all__ = ["FORMAT", "SevenScenes"]
 
+log = logging.getLogger("lightning_pose")
+
 SPLIT_FILES = {"train": "TrainSplit.txt", "test": "TestSplit.txt"}
 COLOUR = Intrinsics(fx=525.0, fy=525.0, cx=320.0, cy=240.0, size=(640, 480))
 """Nominal values of the Kinect's colour camera, in pixels."""
-FRAME_FILE = re.compile(r"frame-(\d+)\.(?:(color\.(?:png|jpe?g))|(pose\.txt))")
 
 
 class SevenScenes(SceneFormat):
     """`TrainSplit.txt` and `TestSplit.txt` list sequences as `sequenceN`, the folder `seq-NN`.
 
     Each sequence holds `frame-NNNNNN.color.png` (or jpg) and `frame-NNNNNN.pose.txt`, the 4x4
-    camera-to-world matrix in metres, OpenCV axes. A rendered room has a file `synthetic.json` with
-    its camera as `intrinsics`: `fx`, `fy`, `cx`, `cy`; real scenes get the Kinect's nominal values.
+    camera-to-world matrix in metres, OpenCV axes. Without both split files, every `seq-NN` is read, or the folder
+    itself if it holds the frames. A rendered room has a file `synthetic.json` with its camera as `intrinsics`: `fx`,
+    `fy`, `cx`, `cy`; real scenes get the Kinect's nominal values.
     """
 
     name = "7scenes"
-    looks_for = "TrainSplit.txt and TestSplit.txt"
+    looks_for = "TrainSplit.txt and TestSplit.txt, or seq-NN/frame-NNNNNN.pose.txt"
 
     def matches(self, root: Path) -> bool:
-        return all((root / file).is_file() for file in SPLIT_FILES.values())
+        if all(find_file(root, file).is_file() for file in SPLIT_FILES.values()):
+            return True
+        is_12_scenes = find_file(root, "split.txt").is_file()
+        return not is_12_scenes and (
+            has_posed_frames(root) or any(map(has_posed_frames, _find_sequences(root).values()))
+        )
 
     def read(self, root: Path) -> Scene:
-        split_of = _read_split_files(root)
+        folders = _find_sequences(root)
+        split_of = _read_split_files(root, folders)
+        if split_of:
+            _warn_of_unlisted_sequences(root, folders, split_of)
+            read = {name: folders[name] for name in split_of}
+        else:
+            read = folders or {root.resolve().name: root}
         intrinsics = _read_intrinsics(root)
-        frames = sort_frames(frame for sequence in split_of for frame in _read_sequence(root / sequence, intrinsics))
+        frames, faults = [], []
+        for name, folder in read.items():
+            listed = read_frame_folder(folder)
+            faults += listed.faults
+            frames += [
+                Frame(image, position, quat, name, index, intrinsics=intrinsics)
+                for index, image, position, quat in zip(*listed[:4], strict=True)
+            ]
+        usable, bad = keep_usable(frames, faults)
         splits = {
-            split: np.array([i for i, frame in enumerate(frames) if split_of[frame.sequence] == split])
-            for split in SPLIT_FILES
+            split: np.array([i for i, frame in enumerate(usable) if split_of[frame.sequence] == split], dtype=int)
+            for split in (SPLIT_FILES if split_of else ())
         }
         ground_truth = "synthetic" if (root / "synthetic.json").is_file() else "original"
-        return Scene(root.resolve().name, root, self.name, frames, splits, ground_truth=ground_truth)
+        name = root.resolve().name
+        return Scene(name, root, self.name, usable, splits, ground_truth=ground_truth, bad_frames=bad)
 
 
 FORMAT = SevenScenes()
 
 
-def _read_split_files(root: Path) -> dict[str, str]:
-    """The split of each listed sequence, by the name of its folder."""
+def _find_sequences(root: Path) -> dict[str, Path]:
+    """Folders of the sequences, by the name `seq-NN` that 7-Scenes gives them."""
+    found = {}
+    for path in list_files(root) if root.is_dir() else []:
+        match = re.fullmatch(r"(?:seq|sequence)[-_]?(\d{1,9})", path.name, re.IGNORECASE)
+        if match and path.is_dir():
+            inner = path / path.name  # some programs unpack seq-01.zip into seq-01/seq-01
+            found.setdefault(f"seq-{int(match[1]):02d}", inner if inner.is_dir() else path)
+    return found
+
+
+def _read_split_files(root: Path, folders: Mapping[str, Path]) -> dict[str, str]:
+    """The split of each listed sequence, by its name `seq-NN`; empty without split files."""
+    files = {split: find_file(root, file) for split, file in SPLIT_FILES.items()}
+    if not any(file.is_file() for file in files.values()) and (folders or has_posed_frames(root)):
+        return {}
     split_of: dict[str, str] = {}
-    for split, file in SPLIT_FILES.items():
-        lines = read_lines(root / file)
+    for split, file in files.items():
+        lines = read_lines(file)
         if not lines:
-            raise DataError(f"{root / file} is empty; list the {split} sequences in it as `sequenceN`")
+            raise DataError(f"{file} is empty; list the {split} sequences in it as `sequenceN`")
         for number, line in lines:
-            place = f"{root / file}:{number}"
-            match = re.fullmatch(r"sequence\s*(\d+)", line)
+            place = f"{file}:{number}"
+            match = re.fullmatch(r"sequence\s*(\d{1,9})|seq-?(\d{1,9})", line, re.IGNORECASE)
             if match is None:
-                raise DataError(f"{place}: expected `sequenceN`, found `{line}`; correct the line")
-            folder = f"seq-{int(match[1]):02d}"
-            if split_of.get(folder, split) != split:
+                raise DataError(f"{place}: expected `sequenceN`, found `{line[:200]}`; correct the line")
+            name = f"seq-{int(match[1] or match[2]):02d}"
+            if split_of.get(name, split) != split:
                 raise DataError(f"{place}: `{line}` is also in {SPLIT_FILES['train']}; take it out of one")
-            if not (root / folder).is_dir():
+            if name not in folders:
                 raise DataError(
-                    f"{place}: `{line}` is listed, but {root / folder} is missing; unzip {folder}.zip there, "
+                    f"{place}: `{line}` is listed, but {root / name} is missing; unzip {name}.zip there, "
                     "or take the line out"
                 )
-            split_of[folder] = split
+            split_of[name] = split
     return split_of
 
 
-def _read_sequence(folder: Path, intrinsics: Intrinsics) -> list[Frame]:
-    """Read the frames of one sequence, in no particular order."""
-    images: dict[int, Path] = {}
-    poses: dict[int, Path] = {}
-    for path in folder.iterdir():
-        if match := FRAME_FILE.fullmatch(path.name):
-            (images if match[2] else poses)[int(match[1])] = path
-    if not images:
-        raise DataError(f"{folder} has no frame-NNNNNN.color.png or .jpg; unpack the images into it")
-    for index in sorted(images.keys() ^ poses.keys()):
-        if index in images:
-            raise DataError(f"{images[index]} has no .pose.txt beside it; add it or drop the image")
-        raise DataError(f"{poses[index]} has no image beside it; add it or drop the pose")
-    where = [str(poses[index]) for index in images]
-    positions, quats = convert_matrices(np.stack([_read_matrix(poses[i]) for i in images]), where)
-    return [
-        Frame(path, position, quat, folder.name, index, intrinsics=intrinsics)
-        for (index, path), position, quat in zip(images.items(), positions, quats, strict=True)
-    ]
-
-
-def _read_matrix(path: Path) -> np.ndarray:
-    """Read a pose file, (4, 4) float64."""
-    try:
-        # np.loadtxt is forty times slower, and a scene has thousands of these files.
-        return np.array(path.read_text().split(), dtype=np.float64).reshape(4, 4)
-    except ValueError as error:
-        raise DataError(f"{path}: not a 4x4 matrix of numbers ({error}); restore the original") from error
+def _warn_of_unlisted_sequences(root: Path, folders: Mapping[str, Path], split_of: Mapping[str, str]) -> None:
+    """Log a warning that names the sequences that have frames and are in no split file."""
+    left = [name for name, folder in folders.items() if name not in split_of and has_posed_frames(folder)]
+    if left:
+        files = " nor in ".join(SPLIT_FILES.values())
+        log.warning("%s: %s have frames but are neither in %s; they are not used", root, ", ".join(left), files)
 
 
 def _read_intrinsics(root: Path) -> Intrinsics:
@@ -109,8 +127,10 @@ def _read_intrinsics(root: Path) -> Intrinsics:
     if not path.is_file():
         return COLOUR
     try:
-        camera = json.loads(path.read_text())["intrinsics"]
-        fx, fy, cx, cy = (float(camera[name]) for name in ("fx", "fy", "cx", "cy"))
-        return Intrinsics(fx, fy, cx, cy)
-    except (ValueError, KeyError, TypeError) as error:
+        camera = json.loads(read_text(path))["intrinsics"]
+        numbers = {name: float(camera[name]) for name in ("fx", "fy", "cx", "cy")}
+        if not (np.isfinite(list(numbers.values())).all() and min(numbers["fx"], numbers["fy"]) > 0):
+            raise ValueError(f"found {numbers}")
+        return Intrinsics(numbers["fx"], numbers["fy"], numbers["cx"], numbers["cy"])
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise DataError(f"{path}: no `intrinsics` of fx, fy, cx, cy ({error!r}); render the room again") from error

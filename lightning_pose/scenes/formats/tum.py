@@ -3,12 +3,24 @@
 from __future__ import annotations
 
 import logging
+import re
+from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from lightning_pose.errors import DataError
-from lightning_pose.scenes.formats.base import SceneFormat, read_lines, read_table, require_images, unit_quats
+from lightning_pose.scenes.formats.base import SceneFormat, keep_usable
+from lightning_pose.scenes.formats.image_files import (
+    ImageFinder,
+    choose_listed_images,
+    has_image_suffix,
+    parse_image_line,
+    warn_of_unlisted_images,
+)
+from lightning_pose.scenes.formats.poses import check_quats
+from lightning_pose.scenes.formats.text_files import NumberTable, find_file, list_files, read_lines, read_table
 from lightning_pose.scenes.scene import Frame, Intrinsics, Scene
 
 __all__ = ["FORMAT", "TRAJECTORY_COLUMNS", "Tum", "is_numbered", "pair_by_time"]
@@ -30,41 +42,58 @@ CAMERAS = {
 class Tum(SceneFormat):
     """`rgb.txt` with `timestamp path`, `groundtruth.txt` with `timestamp tx ty tz qx qy qz qw`.
 
-    Poses are camera-to-world, metres; the quaternion is xyzw. Images and poses are paired by time, one to
-    one, within 20 ms; images without a pose are dropped with a warning. The folder is one sequence.
+    Poses are camera-to-world, metres; the quaternion is xyzw unless the header names another order. Images and poses
+    are paired by time, one to one, within 20 ms; images without a pose are dropped with a warning. Times are seconds;
+    nanoseconds, microseconds and milliseconds are recognised and converted, with a warning. The folder is one sequence.
     """
 
     name = "tum"
     looks_for = "rgb.txt and groundtruth.txt"
 
     def matches(self, root: Path) -> bool:
-        trajectory = root / "groundtruth.txt"
-        return (root / "rgb.txt").is_file() and trajectory.is_file() and not is_numbered(trajectory)
+        files = [find_file(root, name) for name in ("rgb.txt", "groundtruth.txt")]
+        return all(file.is_file() for file in files) and not is_numbered(root)
 
     def read(self, root: Path) -> Scene:
-        times, images = _read_image_list(root / "rgb.txt")
-        table, where = read_table(root / "groundtruth.txt", TRAJECTORY_COLUMNS)
-        pairs = pair_by_time(times, table[:, 0])
+        listed = _read_image_list(root, find_file(root, "rgb.txt"))
+        trajectory = find_file(root, "groundtruth.txt")
+        table = read_table(trajectory, TRAJECTORY_COLUMNS)
+        _warn_of_rows_without_time(trajectory, table)
+        pose_times = _convert_to_seconds(table.values[:, 0], table.header, trajectory)
+        _warn_of_equal_times(trajectory, pose_times)
+        pairs = pair_by_time(listed.times, pose_times)
         if not len(pairs):
             raise DataError(
-                f"{root}: none of the {len(times)} images has a pose within 20 ms; "
-                f"rgb.txt spans {_format_span(times)}, groundtruth.txt {_format_span(table[:, 0])}; "
-                "bring both to one clock"
+                f"{root}: none of the {len(listed.times)} images has a pose within 20 ms; rgb.txt spans "
+                f"{_format_span(listed.times)}, groundtruth.txt {_format_span(pose_times)}; bring both to one clock"
             )
-        if len(pairs) < len(times):
-            log.warning("%s: dropped %d of %d images, no pose within 20 ms", root, len(times) - len(pairs), len(times))
-        quats = unit_quats(table[:, 4:], where, scalar_first=False)
+        missed = len(listed.times) - len(pairs)
+        if missed:
+            log.warning("%s: dropped %d of %d images, no pose within 20 ms", root, missed, len(listed.times))
+        rows = pairs[:, 1]
+        position_m, quats, found = check_quats(table.values[rows, 1:4], table.values[rows, 4:], scalar_first=False)
+        faults = [
+            table.faults[j] or (wrong and f"{table.places[j]}: {wrong}") for j, wrong in zip(rows, found, strict=True)
+        ]
         name = root.resolve().name
         intrinsics = next((camera for key, camera in CAMERAS.items() if key in name), None)
-        frames = tuple(
-            Frame(root / images[i], table[j, 1:4], quats[j], name, int(i), float(times[i]), intrinsics)
-            for i, j in pairs
-        )
-        require_images((frame.image for frame in frames), "rgb.txt")
-        return Scene(name, root, self.name, frames)
+        frames = [
+            Frame(listed.images[i], position, quat, name, int(i), float(listed.times[i]), intrinsics)
+            for i, position, quat in zip(pairs[:, 0], position_m, quats, strict=True)
+        ]
+        usable, bad = keep_usable(frames, faults, "rgb.txt")
+        return Scene(name, root, self.name, usable, bad_frames=(*listed.faults, *bad))
 
 
 FORMAT = Tum()
+
+
+class ImageList(NamedTuple):
+    """Images by ascending time: (N,) seconds, N files; and the lines of the list that name no image, in words."""
+
+    times: np.ndarray
+    images: list[Path]
+    faults: list[str]
 
 
 def pair_by_time(times: np.ndarray, pose_times: np.ndarray) -> np.ndarray:
@@ -72,12 +101,12 @@ def pair_by_time(times: np.ndarray, pose_times: np.ndarray) -> np.ndarray:
 
     Args:
         times: (N,) seconds.
-        pose_times: (M,) seconds, in any order.
+        pose_times: (M,) seconds, in any order; NaN where a pose has no time.
 
     Returns:
         (K, 2) pairs of an image's row and a pose's row, in the order of the images, at most 20 ms apart.
     """
-    order = np.argsort(pose_times, kind="stable")
+    order = np.argsort(pose_times, kind="stable")  # NaN last
     first = np.searchsorted(pose_times[order], times - MAX_DIFFERENCE_S, side="left")
     last = np.searchsorted(pose_times[order], times + MAX_DIFFERENCE_S, side="right")
     candidates = [(i, order[j]) for i in range(len(times)) for j in range(first[i], last[i])]
@@ -91,29 +120,94 @@ def pair_by_time(times: np.ndarray, pose_times: np.ndarray) -> np.ndarray:
     return np.array(sorted(pose_of.items()), dtype=int).reshape(-1, 2)
 
 
-def is_numbered(trajectory: Path) -> bool:
-    """Whether the first column counts frames (0, 1, 2, ... or 1, 2, 3, ...) and has no times."""
-    numbers = [line.split()[0] for _, line in read_lines(trajectory)]
-    return numbers[:1] in (["0"], ["1"]) and all(
-        number == str(int(numbers[0]) + row) for row, number in enumerate(numbers)
-    )
+def is_numbered(root: Path) -> bool:
+    """Whether `groundtruth.txt` counts frames (0, 1, 2, ... or 1.0, 2.0, 3.0, ...) and the images are `rgb/N.png`.
+
+    Such a folder is read as ICL-NUIM.
+    """
+    images = root / "rgb"
+    if not images.is_dir() or not any(path.stem.isdecimal() for path in list_files(images)):
+        return False
+    numbers = read_table(find_file(root, "groundtruth.txt"), TRAJECTORY_COLUMNS).values[:, 0]
+    return len(numbers) > 0 and numbers[0] in (0, 1) and bool((numbers == numbers[0] + np.arange(len(numbers))).all())
 
 
-def _read_image_list(path: Path) -> tuple[np.ndarray, list[str]]:
-    """Read the image list: times in seconds, ascending, and the paths as listed, in the same order."""
-    entries = []
-    for number, line in read_lines(path):
+def _read_image_list(root: Path, path: Path) -> ImageList:
+    """Read the image list.
+
+    Raises:
+        DataError: it lists no image.
+    """
+    finder = ImageFinder(root)
+    header: list[str] = []
+    found: list[tuple[float, Path]] = []
+    faults: list[str] = []
+    for number, line in read_lines(path, comments=True):
+        if line.startswith("#"):
+            header.append(line)
+            continue
         try:
-            time, image = line.split(maxsplit=1)
-            entries.append((float(time), image))
+            time, listed = parse_image_line(line)
+            if not np.isfinite(float(time)):
+                raise ValueError(time)
+            found.append((float(time), finder.find(listed)))
         except ValueError:
-            raise DataError(f"{path}:{number}: expected `timestamp path`, found `{line}`; fix it") from None
-    if not entries:
-        raise DataError(f"{path} lists no image; give one `timestamp path` a line")
-    entries.sort()
-    return np.array([time for time, _ in entries]), [image for _, image in entries]
+            if found or faults or has_image_suffix(line):
+                faults.append(f"{path}:{number}: expected `timestamp path`, found `{line[:200]}`; fix it")
+            else:
+                header.append(line)
+    if not found:
+        raise DataError(faults[0] if faults else f"{path} lists no image; give one `timestamp path` a line")
+    finder.warn(path.name)
+    warn_of_unlisted_images((image for _, image in found), path.name)
+    chosen = choose_listed_images(image for _, image in found)
+    found = sorted(entry for entry in found if entry[1] in chosen)
+    times = _convert_to_seconds(np.array([time for time, _ in found]), header, path)
+    return ImageList(times, [image for _, image in found], faults)
+
+
+def _convert_to_seconds(times: np.ndarray, header: Sequence[str], path: Path) -> np.ndarray:
+    """Times in seconds, with a warning if the file has another unit.
+
+    The unit is nanoseconds if the header says so. Otherwise it follows from the times: seconds since 1970 have 10
+    digits, milliseconds 13, microseconds 16 and nanoseconds 19; of times that begin at zero, a step of 100,000 or more
+    cannot be seconds.
+    """
+    finite = times[np.isfinite(times)]
+    if not len(finite):
+        return times
+    largest = float(np.abs(finite).max())
+    step = float(np.median(np.diff(np.unique(finite)))) if len(np.unique(finite)) > 1 else 0.0
+    in_header = any(re.search(r"(?<![a-z])(?:ns|nsecs?|nanoseconds?)(?![a-z])", line.lower()) for line in header)
+    if in_header or largest >= 1e17 or (largest < 1e11 and step >= 5e5):
+        unit, per_second = "nanoseconds", 1e9
+    elif largest >= 1e14 or (largest < 1e11 and step >= 1e5):
+        unit, per_second = "microseconds", 1e6
+    elif largest >= 1e11:
+        unit, per_second = "milliseconds", 1e3
+    else:
+        return times
+    log.warning("%s: the times are read as %s; write seconds if they are not", path, unit)
+    return times / per_second
+
+
+def _warn_of_rows_without_time(path: Path, table: NumberTable) -> None:
+    """Log how many lines of a trajectory belong to no time, so that no image can use them."""
+    without = np.flatnonzero(~np.isfinite(table.values[:, 0]))
+    if len(without):
+        log.warning(
+            "%s: %d lines have no time and are not used, such as %s", path, len(without), table.places[without[0]]
+        )
+
+
+def _warn_of_equal_times(path: Path, times: np.ndarray) -> None:
+    """Log a warning if most lines of a trajectory have the time of another line."""
+    different = len(np.unique(times[np.isfinite(times)]))
+    if 2 * different < len(times):
+        log.warning("%s: %d lines have %d different times; write times with all digits", path, len(times), different)
 
 
 def _format_span(times: np.ndarray) -> str:
     """First and last time, in words."""
-    return f"{times.min():.3f} to {times.max():.3f} s" if len(times) else "nothing"
+    finite = times[np.isfinite(times)]
+    return f"{finite.min():.3f} to {finite.max():.3f} s" if len(finite) else "nothing"

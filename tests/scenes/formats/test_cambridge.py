@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lightning_pose.errors import DataError, ImageError
+from lightning_pose.errors import DataError
 from lightning_pose.scenes.formats import load_scene
 from tests.data.helpers import make_image
 
@@ -90,10 +90,77 @@ def test_empty_list_is_refused(tmp_path: Path) -> None:
 def test_missing_image_is_named(tmp_path: Path) -> None:
     write(tmp_path, TRAIN, TEST)
     (tmp_path / "seq2" / "frame00003.png").unlink()
-    with pytest.raises(ImageError, match=r"frame00003.png is missing, listed in .*\(1 such images\); unpack"):
+    with pytest.raises(DataError, match=r"1 of 4 frames.*frame00003.png is missing, listed in .*; unpack"):
         load_scene(tmp_path)
 
 
 def test_forced_on_another_folder_names_the_missing_list(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"dataset_train.txt is missing"):
         load_scene(tmp_path, format="cambridge")
+
+
+@pytest.mark.parametrize("header", ["", "ImageFile, Camera Position [X Y Z W P Q R]\n", "# made by hand\n", HEADER])
+def test_a_line_that_parses_as_data_is_data(header: str, tmp_path: Path) -> None:
+    write(tmp_path, TRAIN, TEST)
+    for file in ("dataset_train.txt", "dataset_test.txt"):
+        path = tmp_path / file
+        path.write_text(path.read_text().replace(HEADER, header))
+    assert len(load_scene(tmp_path).frames) == 4
+
+
+def test_header_gives_the_order_of_the_quaternion(tmp_path: Path) -> None:
+    write(tmp_path, [f"seq1/frame0000{i}.png 4 5 6 {HALF} 0 0 {HALF}" for i in (2, 3)], TEST)
+    path = tmp_path / "dataset_train.txt"
+    path.write_text(path.read_text().replace("W P Q R", "P Q R W"))
+    np.testing.assert_allclose(load_scene(tmp_path).frames[1].quat_wxyz, [HALF, -HALF, 0, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize("separator", [",", ", ", "\t", ";"])
+def test_separators(separator: str, tmp_path: Path) -> None:
+    write(tmp_path, TRAIN, TEST)
+    for file in ("dataset_train.txt", "dataset_test.txt"):
+        path = tmp_path / file
+        path.write_text(HEADER + path.read_text()[len(HEADER) :].replace(" ", separator))
+    np.testing.assert_allclose(load_scene(tmp_path).frames[-1].position_m, [4, 5, 6])
+
+
+def test_blanks_in_names(tmp_path: Path) -> None:
+    write(tmp_path, TRAIN, TEST)
+    for path in (tmp_path / "dataset_train.txt", tmp_path / "dataset_test.txt"):
+        path.write_text(path.read_text().replace("/frame", " a/my frame "))
+    for image in tmp_path.glob("seq*/*.png"):
+        make_image(tmp_path / f"{image.parent.name} a" / image.name.replace("frame", "my frame "))
+    assert load_scene(tmp_path).frames[-1].sequence == "seq10 a"
+
+
+def test_names_that_begin_with_a_date_are_numbered_in_order(tmp_path: Path) -> None:
+    times = (103052, 103059, 103106, 235959)
+    rows = [f"seq1/img_20190415_{t}.png {i} 0 0 1 0 0 0" for i, t in enumerate(times)]
+    frames = load_scene(write(tmp_path, rows, ["seq2/img_20190415_120000.png 0 0 0 1 0 0 0"]), val_fraction=0).frames
+    assert [(f.sequence, f.index) for f in frames] == [*[("seq1", i) for i in range(4)], ("seq2", 0)]
+    np.testing.assert_allclose([f.position_m[0] for f in frames[:4]], range(4))
+
+
+def test_bad_frames_are_dropped_with_their_count(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    bad = ["seq2/frame00013.png nan 0 0 1 0 0 0", "seq2/frame00014.png 0 0 0 0 0 0 0", "seq2/frame00015.png 1 2 3"]
+    write(tmp_path, [*TRAIN, *bad], TEST)
+    (tmp_path / "seq2" / "frame00003.png").unlink()
+    with pytest.raises(DataError, match=r"4 of 7 frames cannot be used: .*frame00003.png is missing.*train.txt:7: "):
+        load_scene(tmp_path)
+    with caplog.at_level(logging.WARNING, "lightning_pose"):
+        scene = load_scene(tmp_path, on_bad_frame="drop", val_fraction=0)
+    assert "4 of 7 frames cannot be used" in caplog.text
+    np.testing.assert_array_equal(scene.splits["train"], [1, 2])
+
+
+def test_nothing_left_of_a_split_is_refused(tmp_path: Path) -> None:
+    write(tmp_path, TRAIN, ["seq1/frame00001.png nan 8 9 1 0 0 0"])
+    with pytest.raises(DataError, match=r"no usable frame for the test split; 1 of 4 frames cannot be used"):
+        load_scene(tmp_path, on_bad_frame="drop")
+
+
+def test_lines_gone_are_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    make_image(write(tmp_path, TRAIN, TEST) / "seq2" / "frame00099.png")
+    with caplog.at_level(logging.WARNING, "lightning_pose"):
+        load_scene(tmp_path)
+    assert "1 of 3 images are not in dataset_train.txt or dataset_test.txt" in caplog.text

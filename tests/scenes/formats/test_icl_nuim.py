@@ -83,3 +83,45 @@ def test_numbers_that_never_meet_are_refused(tmp_path: Path) -> None:
 def test_forced_without_a_trajectory(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"no \*.gt.freiburg and no numbered groundtruth.txt; add one"):
         load_scene(tmp_path, format="icl_nuim")
+
+
+@pytest.mark.parametrize(
+    "line", ["{0} rgb/{0}.png {0} depth/{0}.png", "{0} depth/{0}.png {0} rgb/{0}.png", "{0} rgb/{0}.png"]
+)
+def test_colour_image_is_told_by_its_name(line: str, tmp_path: Path) -> None:
+    write(tmp_path)
+    for number in range(4):
+        make_image(tmp_path / "depth" / f"{number}.png")
+    (tmp_path / "associations.txt").write_text("\n".join(line.format(number) for number in (1, 2, 3)))
+    assert [f.image.parent.name for f in load_scene(tmp_path).frames] == ["rgb"] * 3
+
+
+def test_numbers_may_have_decimals(tmp_path: Path) -> None:
+    write(tmp_path)
+    (tmp_path / "livingRoom2.gt.freiburg").rename(tmp_path / "groundtruth.txt")
+    path = tmp_path / "groundtruth.txt"
+    path.write_text("".join(f"{row[0]}.000000{row[1:]}\n" for row in ROWS))
+    assert load_scene(tmp_path).format == "icl_nuim"
+
+
+def test_files_of_macos_are_no_images_and_no_trajectories(tmp_path: Path) -> None:
+    write(tmp_path)
+    (tmp_path / "._livingRoom2.gt.freiburg").write_bytes(b"\0\5\x16\7")
+    make_image(tmp_path / "rgb" / "._1.png")
+    assert len(load_scene(tmp_path).frames) == 3
+
+
+def test_bad_rows_are_dropped(tmp_path: Path) -> None:
+    write(tmp_path, images=5)
+    rows = [*ROWS, "4 0 0 0 nan 0 0 1", f"{'9' * 5000} 0 0 0 0 0 0 1", "50 0 0 0 0 0 0 0"]
+    (tmp_path / "livingRoom2.gt.freiburg").write_text("\n".join(rows))
+    with pytest.raises(DataError, match=r"1 of 4 frames cannot be used: .*gt.freiburg:4: expected"):
+        load_scene(tmp_path)
+    assert [f.index for f in load_scene(tmp_path, on_bad_frame="drop").frames] == [1, 2, 3]
+
+
+def test_two_trajectories_are_refused(tmp_path: Path) -> None:
+    write(tmp_path)
+    (tmp_path / "livingRoom1.gt.freiburg").write_text("\n".join(ROWS))
+    with pytest.raises(DataError, match=r"2 trajectories, livingRoom1.gt.freiburg, livingRoom2.gt.freiburg; keep"):
+        load_scene(tmp_path)

@@ -27,7 +27,7 @@ FORMAT = Added()
 
 
 def test_formats() -> None:
-    assert {"7scenes", "cambridge", "icl_nuim", "tum"} <= known_formats().keys()
+    assert {"12scenes", "7scenes", "cambridge", "icl_nuim", "tum"} <= known_formats().keys()
 
 
 def test_a_format_is_one_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -39,7 +39,7 @@ def test_a_format_is_one_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_unknown_format_lists_the_known(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"'kitti' is unknown; the formats are 7scenes, cambridge, "):
+    with pytest.raises(ConfigError, match=r"'kitti' is unknown; the formats are 12scenes, 7scenes, cambridge, "):
         load_scene(tmp_path, format="kitti")
 
 
@@ -49,7 +49,7 @@ def test_missing_folder(tmp_path: Path) -> None:
 
 
 def test_no_dataset_lists_the_files_that_were_looked_for(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"7scenes: TrainSplit.txt and TestSplit.txt; .* force a format") as caught:
+    with pytest.raises(DataError, match=r"7scenes: TrainSplit.txt and TestSplit.txt, .* force a format") as caught:
         load_scene(str(tmp_path))
     assert str(tmp_path) in str(caught.value)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -130,6 +131,99 @@ def test_rounded_rotation_becomes_the_nearest_one(root: Path) -> None:
     set_pose(root, turned(1.0005))
     quat = load_scene(root).frames[7].quat_wxyz
     np.testing.assert_allclose(quat, [0.5**0.5, 0, 0, 0.5**0.5], atol=1e-9)
+
+
+def test_bad_frames_are_counted_and_dropped(root: Path, caplog: pytest.LogCaptureFixture) -> None:
+    set_pose(root, np.full((4, 4), -np.inf), 0)
+    (root / "seq-12" / "frame-000001.pose.txt").unlink()
+    (root / "seq-01" / "frame-000003.pose.txt").write_text("")
+    pattern = r"3 of 10 frames .*seq-01/frame-000003.*seq-12/frame-000000.*seq-12/frame-000001.*data.on_bad_frame: drop"
+    with pytest.raises(DataError, match=pattern):
+        load_scene(root)
+    with caplog.at_level(logging.WARNING, "lightning_pose"):
+        scene = load_scene(root, val_fraction=0, on_bad_frame="drop")
+    assert "3 of 10 frames cannot be used" in caplog.text
+    assert len(scene.bad_frames) == 3
+    np.testing.assert_array_equal(scene.splits["train"], [0, 1, 2, 5, 6])
+    np.testing.assert_array_equal(scene.splits["test"], [3, 4])
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "0,-1,0,2\n1,0,0,12\n0,0,1,0\n0,0,0,1\n",
+        "\ufeff0\t-1\t0\t2\r\n1 0 0 12\r\n0 0 1 0\r\n",
+        "[[0 -1 0 2] [1 0 0 12] [0 0 1 0]]",
+    ],
+)
+def test_other_separators_and_three_rows(text: str, root: Path) -> None:
+    (root / "seq-12" / "frame-000002.pose.txt").write_text(text)
+    frame = load_scene(root).frames[8]
+    np.testing.assert_allclose(frame.position_m, [2, 12, 0])
+    np.testing.assert_allclose(frame.quat_wxyz, [0.5**0.5, 0, 0, 0.5**0.5], atol=1e-7)
+
+
+def test_of_a_png_and_a_jpg_the_png_is_read(root: Path, caplog: pytest.LogCaptureFixture) -> None:
+    for image in root.glob("seq-*/*.png"):
+        image.with_suffix(".jpg").touch()
+    with caplog.at_level(logging.WARNING, "lightning_pose"):
+        assert {f.image.suffix for f in load_scene(root).frames} == {".png"}
+    assert "4 frames have several images; frame-000000.color.png is read" in caplog.text
+
+
+def test_upper_case_and_hidden_files(root: Path, caplog: pytest.LogCaptureFixture) -> None:
+    for image in root.glob("seq-*/*.png"):
+        image.rename(image.with_suffix(".PNG"))
+        (image.parent / f"._{image.name}").touch()
+    for name in ("TrainSplit.txt", "TestSplit.txt"):
+        (root / name).rename(root / name.lower())
+        (root / f"._{name}").touch()
+    with caplog.at_level(logging.WARNING, "lightning_pose"):
+        assert {f.image.suffix for f in load_scene(root).frames} == {".PNG"}
+    assert "4 images are named as frame-000000.color.PNG and are read" in caplog.text
+
+
+def test_split_files_may_name_folders(root: Path) -> None:
+    (root / "TrainSplit.txt").write_text("seq-01\nseq-12\n")
+    (root / "TestSplit.txt").write_text("seq-03\n")
+    assert len(load_scene(root, val_fraction=0).splits["train"]) == 8
+
+
+def test_without_split_files_blocks_are_held_out(root: Path) -> None:
+    for name in ("TrainSplit.txt", "TestSplit.txt"):
+        (root / name).unlink()
+    scene = load_scene(root)
+    assert (scene.format, scene.split_source, len(scene.frames)) == ("7scenes", "blocks", 10)
+    assert len(scene.splits["test"])
+
+
+def test_one_sequence_is_read(root: Path) -> None:
+    scene = load_scene(root / "seq-12")
+    assert (scene.format, scene.split_source) == ("7scenes", "blocks")
+    assert [(f.sequence, f.index) for f in scene.frames] == [("seq-12", i) for i in range(4)]
+
+
+def test_one_split_file_alone_is_refused(root: Path) -> None:
+    (root / "TestSplit.txt").unlink()
+    with pytest.raises(DataError, match=r"TestSplit.txt is missing"):
+        load_scene(root)
+
+
+def test_sequence_in_no_split_file_is_named(root: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (root / "TrainSplit.txt").write_text("sequence1\n")
+    with caplog.at_level(logging.WARNING, "lightning_pose"):
+        assert len(load_scene(root).frames) == 6
+    assert "seq-12 have frames but are neither in TrainSplit.txt nor in TestSplit.txt" in caplog.text
+
+
+def test_number_of_5000_digits_is_refused(root: Path) -> None:
+    (root / "TestSplit.txt").write_text("sequence" + "3" * 5000)
+    with pytest.raises(DataError, match=r"TestSplit.txt:1: expected `sequenceN`"):
+        load_scene(root)
+    (root / "TestSplit.txt").write_text("sequence3")
+    set_pose(root, np.eye(4)).write_text("1 0 0 " + "9" * 5000 + " 0 1 0 0 0 0 1 0 0 0 0 1")
+    with pytest.raises(DataError, match=r"frame-000001.pose.txt: the pose has NaN or infinite"):
+        load_scene(root)
 
 
 @pytest.mark.real_data

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lightning_pose.errors import DataError, ImageError
+from lightning_pose.errors import ConfigError, DataError
 from lightning_pose.scenes.formats import load_scene
 from lightning_pose.scenes.formats.tum import pair_by_time
 from lightning_pose.scenes.scene import Intrinsics
@@ -97,8 +97,109 @@ def test_bad_image_list_is_refused(tmp_path: Path) -> None:
 def test_missing_image_is_named(tmp_path: Path) -> None:
     write(tmp_path, [0.5], ["0.5 0 0 0 0 0 0 1"])
     (tmp_path / "rgb" / "0.500000.png").unlink()
-    with pytest.raises(ImageError, match=r"0.500000.png is missing, listed in rgb.txt .*; unpack"):
+    with pytest.raises(DataError, match=r"0.500000.png is missing, listed in rgb.txt; unpack"):
         load_scene(tmp_path)
+
+
+def test_header_gives_the_order_of_the_quaternion(tmp_path: Path) -> None:
+    write(tmp_path, [1.0, 2.0, 3.0], [])
+    (tmp_path / "groundtruth.txt").write_text(
+        "# timestamp tx ty tz qw qx qy qz\n" + "".join(f"{t} 1 2 3 0.7 0.1 0.1 0.7\n" for t in (1, 2, 3))
+    )
+    np.testing.assert_allclose(load_scene(tmp_path).frames[0].quat_wxyz, [0.7, 0.1, 0.1, 0.7])
+
+
+@pytest.mark.parametrize(
+    ("factor", "start", "unit"),
+    [
+        (1e9, 1600000000, "nanoseconds"),
+        (1e6, 1600000000, "microseconds"),
+        (1e3, 1600000000, "milliseconds"),
+        (1e9, 0, "nanoseconds"),
+    ],
+)
+def test_other_units_of_time_are_converted(
+    factor: float, start: int, unit: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Poses are written 1 ms after the images, in seconds, so that only the right unit pairs them."""
+    times = [start + 0.1 * i for i in range(5)]
+    write(tmp_path, times, [f"{t + 0.001:.4f} {i} 0 0 0 0 0 1" for i, t in enumerate(times)])
+    lines = [f"{round(t * factor)} rgb/{t:.6f}.png" for t in times]
+    (tmp_path / "rgb.txt").write_text("\n".join(lines))
+    with caplog.at_level(logging.WARNING, "lightning_pose"):
+        scene = load_scene(tmp_path)
+    assert f"rgb.txt: the times are read as {unit}" in caplog.text
+    np.testing.assert_allclose(np.array([f.timestamp for f in scene.frames], float), times, atol=1e-5, rtol=0)
+    np.testing.assert_allclose([f.position_m[0] for f in scene.frames], range(5))
+
+
+def test_bad_rows_of_images_are_counted_and_dropped(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    times = [float(t) for t in range(8)]
+    rows = [f"{t} {t} 0 0 0 0 0 1" for t in times]
+    rows[1:5] = ["1 nan nan nan nan nan nan nan", "2 0 0 0 0 0 0 0", "3 1 2", "4 1e300 0 0 0 0 0 1"]
+    write(tmp_path, times, rows)
+    pattern = r"4 of 8 frames cannot be used: .*txt:3: .*txt:4: .*txt:5: .*and 1 more. Or .* data.on_bad_frame: drop"
+    with pytest.raises(DataError, match=pattern):
+        load_scene(tmp_path)
+    with caplog.at_level(logging.WARNING, "lightning_pose"):
+        scene = load_scene(tmp_path, on_bad_frame="drop")
+    assert "4 of 8 frames cannot be used" in caplog.text
+    assert [f.index for f in scene.frames] == [0, 5, 6, 7]
+
+
+def test_bad_rows_that_no_image_uses_refuse_nothing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    rows = [f"{t} {t} 0 0 0 0 0 1" for t in (1, 2, 3)]
+    outside = ["-5 0 0 0 0 0 0 0", "-4 nan nan nan nan nan nan nan", "-3 1 2", "nan 0 0 0 0 0 0 1", "lost"]
+    with caplog.at_level(logging.WARNING, "lightning_pose"):
+        assert len(load_scene(write(tmp_path, [1, 2, 3], [*rows, *outside])).frames) == 3
+    assert "2 lines have no time and are not used, such as" in caplog.text
+
+
+def test_association_list_names_the_colour_image(tmp_path: Path) -> None:
+    write(tmp_path, [1, 2, 3], [f"{t} {t} 0 0 0 0 0 1" for t in (1, 2, 3)])
+    lines = [f"{t}.003 depth/{t}.png {t} rgb/{t:.6f}.png" for t in (1, 2, 3)]
+    (tmp_path / "rgb.txt").write_text("\n".join(lines))
+    assert [f.image.parent.name for f in load_scene(tmp_path).frames] == ["rgb"] * 3
+
+
+def test_lines_gone_from_the_image_list_are_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write(tmp_path, [1, 2, 3, 4], [f"{t} {t} 0 0 0 0 0 1" for t in (1, 2, 3, 4)])
+    lines = (tmp_path / "rgb.txt").read_text().splitlines()
+    (tmp_path / "rgb.txt").write_text("\n".join([*lines[:3], *lines[4:]]))
+    with caplog.at_level(logging.WARNING, "lightning_pose"):
+        load_scene(tmp_path)
+    assert "1 of 4 images are not in rgb.txt" in caplog.text
+
+
+def test_times_without_their_last_digits_are_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write(tmp_path, [1600000000 + 0.1 * i for i in range(9)], [f"1.600000e+09 {i} 0 0 0 0 0 1" for i in range(9)])
+    with caplog.at_level(logging.WARNING, "lightning_pose"), pytest.raises(ConfigError, match="leaves none"):
+        load_scene(tmp_path)
+    assert "groundtruth.txt: 9 lines have 1 different times; write times with all digits" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "name", ["a" * 300 + ".png", "9" * 5000 + "/1.png", "rgb/" + "9" * 5000 + "/1.png", "a/" * 3000, "../../x.png"]
+)
+def test_names_that_no_file_can_have_are_bad_frames(name: str, tmp_path: Path) -> None:
+    write(tmp_path, [1, 2, 3, 4], [f"{t} {t} 0 0 0 0 0 1" for t in (1, 2, 3, 4)])
+    with (tmp_path / "rgb.txt").open("a") as file:
+        file.write(f"2.01 {name}\n")
+    (tmp_path / "rgb.txt").write_text((tmp_path / "rgb.txt").read_text().replace("2.000000 rgb/2.000000.png\n", ""))
+    with pytest.raises(DataError, match=r"1 of 4 frames cannot be used") as caught:
+        load_scene(tmp_path)
+    assert len(str(caught.value)) < 1200
+    assert len(load_scene(tmp_path, on_bad_frame="drop").frames) == 3
+
+
+def test_frame_numbers_and_images_in_another_folder(tmp_path: Path) -> None:
+    for i in range(4):
+        make_image(tmp_path / "images" / f"{i}.png")
+    (tmp_path / "rgb.txt").write_text("".join(f"{i} images/{i}.png\n" for i in range(4)))
+    (tmp_path / "groundtruth.txt").write_text("".join(f"{i} {i} 5 0 0 0 0 1\n" for i in range(4)))
+    scene = load_scene(tmp_path)
+    assert scene.format == "tum"
+    np.testing.assert_allclose(scene.frames[2].position_m, [2, 5, 0])
 
 
 @pytest.mark.real_data
