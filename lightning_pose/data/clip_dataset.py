@@ -169,7 +169,7 @@ class ClipDataset(PoseDataset):
             chosen = torch.rand(len(rows)) < 0.5
             features[chosen] = self.augmentation.mirror(features[chosen])
             position_m[chosen], quat_wxyz[chosen] = mirror_poses(position_m[chosen], quat_wxyz[chosen])
-        return PoseBatch(features, *relative_poses(position_m, quat_wxyz, self.relative_frame), frame)
+        return PoseBatch(features, *self._relate_poses(position_m, quat_wxyz), frame)
 
     def _rows(self, starts: Tensor, ends: Tensor) -> Tensor:
         """(B, T) rows of `data` of the clips that begin at `starts` in runs that end before `ends`."""
@@ -188,7 +188,12 @@ class ClipDataset(PoseDataset):
     def targets(self) -> tuple[Tensor, Tensor]:
         """Relative poses (W, T, 3) and (W, T, 4) of all clips as they are cut, without augmentation."""
         rows = self.rows()
-        return relative_poses(self.data.position_m[rows], self.data.quat_wxyz[rows], self.relative_frame)
+        return self._relate_poses(self.data.position_m[rows], self.data.quat_wxyz[rows])
+
+    def _relate_poses(self, position_m: Tensor, quat_wxyz: Tensor) -> tuple[Tensor, Tensor]:
+        """Poses (W, T, ...) relative to each clip's first frame, computed in float64, in the data's own precision."""
+        moved, turned = relative_poses(position_m.double(), quat_wxyz.double(), self.relative_frame)
+        return moved.to(position_m.dtype), turned.to(quat_wxyz.dtype)
 
     def rows(self) -> Tensor:
         """(W, T) rows of `data` of all clips, likewise."""
