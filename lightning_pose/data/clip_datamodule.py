@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import ClassVar, cast
@@ -16,9 +17,12 @@ from lightning_pose.features import FeatureExtractor
 from lightning_pose.geometry.relative import RelativeFrame, check_relative_frame
 from lightning_pose.scenes.combine import join_scenes
 from lightning_pose.scenes.formats import load_scene
+from lightning_pose.scenes.gaps import describe_gaps
 from lightning_pose.scenes.scene import Scene
 
 __all__ = ["ClipDataModule", "require_clips"]
+
+_log = logging.getLogger("lightning_pose")
 
 LONGEST = 400
 """Frames of the longest clip that the thesis tests."""
@@ -121,7 +125,11 @@ class ClipDataModule(SceneDataModule):
                 self._load([room_folder(seed, self.room_frames) for seed in seeds])
                 for seeds in (self.train_rooms, self.test_rooms)
             )
-        return join_scenes(train, test)
+        scene = join_scenes(train, test)
+        gaps = describe_gaps(scene)
+        if gaps is not None:
+            _log.warning("%s: %s", scene.name, gaps)
+        return scene
 
     def _load(self, roots: Sequence[str | Path]) -> list[Scene]:
         return [load_scene(root, self.format, self.val_fraction, val_block=self._shape.span) for root in roots]

@@ -13,6 +13,7 @@ from torch import Tensor
 from lightning_pose.data.batches import PoseBatch, PoseDataset
 from lightning_pose.errors import ConfigError, DataError
 from lightning_pose.geometry.relative import RelativeFrame, relative_poses
+from lightning_pose.scenes.gaps import find_run_starts
 from lightning_pose.scenes.scene import Scene
 
 __all__ = ["Augmentation", "ClipDataset", "ClipShape", "find_runs", "mirror_poses"]
@@ -79,7 +80,7 @@ class Augmentation:
 
 
 def find_runs(scene: Scene, indices: np.ndarray) -> list[np.ndarray]:
-    """Find the rows of `indices` that follow each other in one sequence, with no frame of another split between.
+    """Find the rows of `indices` that follow each other in one sequence, with no gap or other split's frame between.
 
     Args:
         scene: whose frames of a sequence are consecutive.
@@ -90,8 +91,7 @@ def find_runs(scene: Scene, indices: np.ndarray) -> list[np.ndarray]:
     """
     if not len(indices):
         return []
-    sequences = np.array([scene.frames[i].sequence for i in indices])
-    breaks = np.flatnonzero((np.diff(indices) > 1) | (sequences[1:] != sequences[:-1])) + 1
+    breaks = np.flatnonzero((np.diff(indices) > 1) | find_run_starts(scene)[indices[1:]]) + 1
     return np.split(np.arange(len(indices)), breaks)
 
 
