@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from lightning_pose.scenes.scene import Scene
@@ -27,8 +29,7 @@ def find_run_starts(scene: Scene) -> np.ndarray:
     sequences = np.array([frame.sequence for frame in scene.frames])
     starts = np.ones(len(sequences), bool)
     starts[1:] = sequences[1:] != sequences[:-1]
-    bounds = [*np.flatnonzero(starts), len(sequences)]
-    for first, end in zip(bounds[:-1], bounds[1:], strict=True):
+    for first, end in pairwise([*np.flatnonzero(starts), len(sequences)]):
         frames = scene.frames[first:end]
         starts[first + 1 : end] |= _find_long_steps([frame.index for frame in frames])
         times = [frame.timestamp for frame in frames if frame.timestamp is not None]
@@ -45,10 +46,9 @@ def describe_gaps(scene: Scene) -> str | None:
     if not after_gap:
         return None
     before, after = scene.frames[after_gap[0] - 1], scene.frames[after_gap[0]]
-    sequences = len(dict.fromkeys(names))
+    gaps = "1 gap" if len(after_gap) == 1 else f"{len(after_gap)} gaps"
     return (
-        f"{sequences} sequence{'s have' if sequences > 1 else ' has'} {len(after_gap)} "
-        f"gap{'s' if len(after_gap) > 1 else ''}, so that there are {int(starts.sum())} runs of consecutive frames, and "
+        f"{gaps}, so that there are {int(starts.sum())} runs of consecutive frames in {len(set(names))} sequences, and "
         f"no clip crosses a gap; the first is in {before.sequence}, from {before.image.name} to {after.image.name}"
     )
 
