@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 
 from lightning_pose.errors import ConfigError
@@ -13,6 +13,9 @@ from lightning_pose.scenes.ground_truth import GroundTruth, apply_ground_truth, 
 from lightning_pose.scenes.scene import Scene
 
 __all__ = ["SceneFolders"]
+
+TEST_FRACTION = 0.2
+"""Part of the frames to test on, of a scene that has no official split."""
 
 
 @dataclass(frozen=True)
@@ -76,14 +79,26 @@ class SceneFolders:
         elif learned is None and rooms is not None:
             learned, asked = ([str(room) for room in part] for part in rooms)
         held_out = 0.0 if validated else self.val_fraction
-        train = self._load(learned or [], held_out, val_block)
-        test = train if asked is None or asked == learned else self._load(asked, held_out, val_block)
-        val = self._load(validated, 0.0, val_block)
+        asked = learned if asked is None else asked
+        tested = {_resolve(folder) for folder in asked or []}
+        read = cache(partial(self._load, val_block=val_block))
+        train = [read(folder, held_out, _resolve(folder) in tested) for folder in learned or []]
+        test = [read(folder, held_out, True) for folder in asked or []]
+        val = [read(folder, 0.0, False) for folder in validated]
         if one_world:
             check_one_world([*train, *test, *val])
         return join_scenes(train, test, val)
 
-    def _load(self, folders: Sequence[str], val_fraction: float, val_block: int) -> list[Scene]:
-        """Read each folder, with the ground truth asked for."""
-        scenes = (load_scene(folder, self.format, val_fraction, val_block=val_block) for folder in folders)
-        return [apply_ground_truth(scene, self.ground_truth, self.pgt) for scene in scenes]
+    def _load(self, folder: str, val_fraction: float, tested: bool, val_block: int) -> Scene:
+        """Read a folder with the ground truth asked for; one that is not tested on keeps all its frames for training.
+
+        An official test split stays apart even then.
+        """
+        test_fraction = TEST_FRACTION if tested else 0.0
+        scene = load_scene(folder, self.format, val_fraction, test_fraction, val_block)
+        return apply_ground_truth(scene, self.ground_truth, self.pgt)
+
+
+def _resolve(folder: str) -> Path:
+    """The folder's one true path, for comparisons."""
+    return Path(folder).expanduser().resolve()
