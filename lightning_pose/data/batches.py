@@ -17,7 +17,7 @@ class PoseBatch(NamedTuple):
 
     Attributes:
         features: (B, ...) as the extractor shapes them; float32, or uint8 for images.
-        position_m: (B, 3) float32, camera centre in the world.
+        position_m: (B, 3) float64, camera centre in the world.
         quat_wxyz: (B, 4) float32, unit, camera-to-world.
         frame: (B,) int64, index of each frame in `Scene.frames`.
     """

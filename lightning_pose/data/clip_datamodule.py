@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
+import logging
 from typing import ClassVar, cast
 
 from torch.utils.data import DataLoader
@@ -11,14 +10,18 @@ from torch.utils.data import DataLoader
 from lightning_pose.data.batches import PoseBatch, make_loader
 from lightning_pose.data.clip_dataset import Augmentation, ClipDataset, ClipShape, find_runs
 from lightning_pose.data.datamodule import SceneDataModule, room_folder
+from lightning_pose.data.scene_folders import SceneFolders
 from lightning_pose.errors import ConfigError
 from lightning_pose.features import FeatureExtractor
 from lightning_pose.geometry.relative import RelativeFrame, check_relative_frame
-from lightning_pose.scenes.combine import join_scenes
-from lightning_pose.scenes.formats import OnBadFrame, load_scene
+from lightning_pose.scenes.formats import OnBadFrame
+from lightning_pose.scenes.gaps import describe_gaps
+from lightning_pose.scenes.ground_truth import GroundTruth
 from lightning_pose.scenes.scene import Scene
 
 __all__ = ["ClipDataModule", "require_clips"]
+
+_log = logging.getLogger("lightning_pose")
 
 LONGEST = 400
 """Frames of the longest clip that the thesis tests."""
@@ -36,7 +39,11 @@ class ClipDataModule(SceneDataModule):
         root: one scene's folder, to train and test on its own splits; instead of `train_scenes`.
         train_scenes: folders of the scenes to train on.
         test_scenes: folders of the scenes to test on; the scenes to train on if not given.
+        val_scenes: folders of the scenes to validate on; part of the training frames if not given.
         format: name of the dataset format of all scenes; recognised from each folder if not given.
+        ground_truth: `original`, as the dataset has it; `registered`, moved to the colour camera (7-Scenes); or `sfm`,
+            from `pgt`.
+        pgt: folder of the pseudo ground truth of Brachmann et al. (ICCV 2021), which holds sfm/7scenes/SCENE_train.txt.
         clip_length: T, 2 to 400.
         stride: from one frame of a clip to the next.
         hop: from the first frame of a clip to that of the next; by default clips share one frame, so that they chain.
@@ -71,7 +78,10 @@ class ClipDataModule(SceneDataModule):
         root: str | None = None,
         train_scenes: list[str] | None = None,
         test_scenes: list[str] | None = None,
+        val_scenes: list[str] | None = None,
         format: str | None = None,
+        ground_truth: GroundTruth = "original",
+        pgt: str | None = None,
         clip_length: int = 10,
         stride: int = 1,
         hop: int | None = None,
@@ -94,11 +104,16 @@ class ClipDataModule(SceneDataModule):
         if clip_length > LONGEST:
             raise ConfigError(f"data.clip_length is {clip_length}; give 2 to {LONGEST} frames")
         self._shape = ClipShape(clip_length, stride, hop)
-        _check_named_once(root, train_scenes, test_scenes)
+        self._folders = SceneFolders(
+            root, train_scenes, test_scenes, val_scenes, format, val_fraction, ground_truth, pgt, on_bad_frame
+        )
         self.root = root
         self.train_scenes = train_scenes
         self.test_scenes = test_scenes
+        self.val_scenes = val_scenes
         self.format = format
+        self.ground_truth: GroundTruth = ground_truth
+        self.pgt = pgt
         self.clip_length = clip_length
         self.stride = stride
         self.hop = hop
@@ -115,23 +130,17 @@ class ClipDataModule(SceneDataModule):
         self.on_bad_frame: OnBadFrame = on_bad_frame
 
     def _load_scene(self) -> Scene:
-        if self.root is not None:
-            train = test = self._load([self.root])
-        elif self.train_scenes is not None:
-            train = self._load(self.train_scenes)
-            test = train if self.test_scenes is None else self._load(self.test_scenes)
-        else:
-            train, test = (
-                self._load([room_folder(seed, self.room_frames) for seed in seeds])
-                for seeds in (self.train_rooms, self.test_rooms)
+        rooms = None
+        if self.root is None and self.train_scenes is None:
+            learned, asked = (
+                [room_folder(seed, self.room_frames) for seed in seeds] for seeds in (self.train_rooms, self.test_rooms)
             )
-        return join_scenes(train, test)
-
-    def _load(self, roots: Sequence[str | Path]) -> list[Scene]:
-        return [
-            load_scene(root, self.format, self.val_fraction, val_block=self._shape.span, on_bad_frame=self.on_bad_frame)
-            for root in roots
-        ]
+            rooms = learned, asked
+        scene = self._folders.load(rooms, val_block=self._shape.span)
+        gaps = describe_gaps(scene)
+        if gaps is not None:
+            _log.warning("%s: %s", scene.name, gaps)
+        return scene
 
     def dataset(self, split: str) -> ClipDataset:
         """One of `train`, `val`, `test` as clips, without augmentation."""
@@ -181,15 +190,3 @@ def require_clips(datamodule: SceneDataModule) -> ClipDataModule:
             "lightning_pose.data.ClipDataModule"
         )
     return datamodule
-
-
-def _check_named_once(root: str | None, train_scenes: list[str] | None, test_scenes: list[str] | None) -> None:
-    """Raise ConfigError if scenes are named in two ways, or none to train on."""
-    if root is not None and (train_scenes or test_scenes):
-        raise ConfigError("data.root is one scene, and data.train_scenes and data.test_scenes are several; give either")
-    if test_scenes is not None and not train_scenes:
-        raise ConfigError(
-            f"data.test_scenes is {test_scenes}, but nothing to train on is named; give data.train_scenes"
-        )
-    if train_scenes == []:
-        raise ConfigError("data.train_scenes is empty; name a scene's folder, or leave it out for synthetic rooms")

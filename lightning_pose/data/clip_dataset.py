@@ -13,6 +13,7 @@ from torch import Tensor
 from lightning_pose.data.batches import PoseBatch, PoseDataset
 from lightning_pose.errors import ConfigError, DataError
 from lightning_pose.geometry.relative import RelativeFrame, relative_poses
+from lightning_pose.scenes.gaps import find_run_starts
 from lightning_pose.scenes.scene import Scene
 
 __all__ = ["Augmentation", "ClipDataset", "ClipShape", "find_runs", "mirror_poses"]
@@ -79,7 +80,7 @@ class Augmentation:
 
 
 def find_runs(scene: Scene, indices: np.ndarray) -> list[np.ndarray]:
-    """Find the rows of `indices` that follow each other in one sequence, with no frame of another split between.
+    """Find the rows of `indices` that follow each other in one sequence, with no gap or other split's frame between.
 
     Args:
         scene: whose frames of a sequence are consecutive.
@@ -90,8 +91,7 @@ def find_runs(scene: Scene, indices: np.ndarray) -> list[np.ndarray]:
     """
     if not len(indices):
         return []
-    sequences = np.array([scene.frames[i].sequence for i in indices])
-    breaks = np.flatnonzero((np.diff(indices) > 1) | (sequences[1:] != sequences[:-1])) + 1
+    breaks = np.flatnonzero((np.diff(indices) > 1) | find_run_starts(scene)[indices[1:]]) + 1
     return np.split(np.arange(len(indices)), breaks)
 
 
@@ -169,7 +169,7 @@ class ClipDataset(PoseDataset):
             chosen = torch.rand(len(rows)) < 0.5
             features[chosen] = self.augmentation.mirror(features[chosen])
             position_m[chosen], quat_wxyz[chosen] = mirror_poses(position_m[chosen], quat_wxyz[chosen])
-        return PoseBatch(features, *relative_poses(position_m, quat_wxyz, self.relative_frame), frame)
+        return PoseBatch(features, *self._relate_poses(position_m, quat_wxyz), frame)
 
     def _rows(self, starts: Tensor, ends: Tensor) -> Tensor:
         """(B, T) rows of `data` of the clips that begin at `starts` in runs that end before `ends`."""
@@ -188,7 +188,12 @@ class ClipDataset(PoseDataset):
     def targets(self) -> tuple[Tensor, Tensor]:
         """Relative poses (W, T, 3) and (W, T, 4) of all clips as they are cut, without augmentation."""
         rows = self.rows()
-        return relative_poses(self.data.position_m[rows], self.data.quat_wxyz[rows], self.relative_frame)
+        return self._relate_poses(self.data.position_m[rows], self.data.quat_wxyz[rows])
+
+    def _relate_poses(self, position_m: Tensor, quat_wxyz: Tensor) -> tuple[Tensor, Tensor]:
+        """Poses (W, T, ...) relative to each clip's first frame, computed in float64, in the data's own precision."""
+        moved, turned = relative_poses(position_m.double(), quat_wxyz.double(), self.relative_frame)
+        return moved.to(position_m.dtype), turned.to(quat_wxyz.dtype)
 
     def rows(self) -> Tensor:
         """(W, T) rows of `data` of all clips, likewise."""

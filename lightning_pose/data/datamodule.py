@@ -119,7 +119,7 @@ class SceneDataModule(LightningDataModule):
         return PoseBatch(
             features=torch.from_numpy(cache.features([frame.image for frame in frames], workers=self.workers)),
             position_m=_stack_rows([frame.position_m for frame in frames], 3),
-            quat_wxyz=_stack_rows([frame.quat_wxyz for frame in frames], 4),
+            quat_wxyz=_stack_rows([frame.quat_wxyz for frame in frames], 4).float(),
             frame=torch.as_tensor(self.scene.splits[split], dtype=torch.int64),
         )
 
@@ -148,8 +148,8 @@ class SceneDataModule(LightningDataModule):
 
 
 def _stack_rows(rows: list[np.ndarray], width: int) -> torch.Tensor:
-    """(N, width) float32 of N rows, also of none."""
-    return torch.from_numpy(np.asarray(rows, dtype=np.float32).reshape(-1, width))
+    """(N, width) float64 of N rows, also of none."""
+    return torch.from_numpy(np.asarray(rows, dtype=np.float64).reshape(-1, width))
 
 
 def find_datamodule(trainer: Trainer) -> SceneDataModule | None:

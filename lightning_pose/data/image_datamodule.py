@@ -1,17 +1,18 @@
-"""ImageDataModule: single posed images of one scene."""
+"""ImageDataModule: single posed images of one scene, or of several recordings in one world."""
 
 from __future__ import annotations
 
 from copy import copy
-from pathlib import Path
 
 from torch.utils.data import DataLoader
 
 from lightning_pose.data.batches import DrawnDataset, PoseBatch, make_loader
 from lightning_pose.data.datamodule import SceneDataModule, room_folder
+from lightning_pose.data.scene_folders import SceneFolders
 from lightning_pose.errors import ConfigError
 from lightning_pose.features import FeatureCache, FeatureExtractor, LocalExtractor
-from lightning_pose.scenes.formats import OnBadFrame, load_scene
+from lightning_pose.scenes.formats import OnBadFrame
+from lightning_pose.scenes.ground_truth import GroundTruth
 from lightning_pose.scenes.scene import Scene
 
 __all__ = ["ImageDataModule"]
@@ -20,10 +21,20 @@ __all__ = ["ImageDataModule"]
 class ImageDataModule(SceneDataModule):
     """Single posed images of one scene, as features.
 
+    Recordings to train and to test on can be given separately, if their positions are in one world: those of TUM RGB-D
+    and ICL-NUIM of one place are. A recording that is only for testing gives its official test split, or all of its
+    frames if it has none.
+
     Args:
         extractor: what the networks read, such as `lightning_pose.features.SURF`.
         root: the scene's folder; none renders the synthetic room on first use.
-        format: name of the dataset format; recognised from the folder if not given.
+        train_scenes: folders of the recordings to train on; instead of `root`.
+        test_scenes: folders of the recordings to test on; those to train on if not given.
+        val_scenes: folders of the recordings to validate on; part of the training frames if not given.
+        format: name of the dataset format of all folders; recognised from each folder if not given.
+        ground_truth: `original`, as the dataset has it; `registered`, moved to the colour camera (7-Scenes); or `sfm`,
+            from `pgt`.
+        pgt: folder of the pseudo ground truth of Brachmann et al. (ICCV 2021), which holds sfm/7scenes/SCENE_train.txt.
         val_fraction: part of the training split kept for validation, in whole blocks of the trajectory; 0 for none.
         batch_size: frames in a training batch.
         eval_batch_size: frames in a batch where no gradient is needed.
@@ -38,7 +49,7 @@ class ImageDataModule(SceneDataModule):
             say how many there are.
 
     Raises:
-        ConfigError: a number is out of its range.
+        ConfigError: a number is out of its range, scenes are named in two ways, or are in different worlds.
         DataError: the scene cannot be read, or a split that is needed is empty.
     """
 
@@ -46,7 +57,12 @@ class ImageDataModule(SceneDataModule):
         self,
         extractor: FeatureExtractor,
         root: str | None = None,
+        train_scenes: list[str] | None = None,
+        test_scenes: list[str] | None = None,
+        val_scenes: list[str] | None = None,
         format: str | None = None,
+        ground_truth: GroundTruth = "original",
+        pgt: str | None = None,
         val_fraction: float = 0.1,
         batch_size: int = 64,
         eval_batch_size: int = 256,
@@ -58,8 +74,16 @@ class ImageDataModule(SceneDataModule):
         on_bad_frame: OnBadFrame = "refuse",
     ) -> None:
         super().__init__(extractor, batch_size, eval_batch_size, cache_dir, workers)
+        self._folders = SceneFolders(
+            root, train_scenes, test_scenes, val_scenes, format, val_fraction, ground_truth, pgt, on_bad_frame
+        )
         self.root = root
+        self.train_scenes = train_scenes
+        self.test_scenes = test_scenes
+        self.val_scenes = val_scenes
         self.format = format
+        self.ground_truth: GroundTruth = ground_truth
+        self.pgt = pgt
         self.val_fraction = val_fraction
         self.feature_pool = feature_pool
         self._pool = None if feature_pool is None else _widen_extractor(extractor, feature_pool)
@@ -68,8 +92,11 @@ class ImageDataModule(SceneDataModule):
         self.on_bad_frame: OnBadFrame = on_bad_frame
 
     def _load_scene(self) -> Scene:
-        root = Path(self.root) if self.root is not None else room_folder(self.room_seed, self.room_frames)
-        return load_scene(root, self.format, self.val_fraction, on_bad_frame=self.on_bad_frame)
+        rooms = None
+        if self.root is None and self.train_scenes is None:
+            room = [room_folder(self.room_seed, self.room_frames)]
+            rooms = room, room
+        return self._folders.load(rooms, one_world=True)
 
     def train_dataloader(self) -> DataLoader[PoseBatch]:
         train = self.dataset("train")

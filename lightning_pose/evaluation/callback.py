@@ -47,7 +47,7 @@ class TestReport(Callback):
     def on_test_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Pose, *args: object, **kwargs: object
     ) -> None:
-        self._poses.append(Pose(*(tensor.float().cpu() for tensor in outputs)))
+        self._poses.append(Pose(outputs.position_m.double().cpu(), outputs.quat_wxyz.float().cpu()))
 
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if not trainer.is_global_zero:

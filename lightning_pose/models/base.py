@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import asdict
 from typing import Any, ClassVar, Literal, NamedTuple
 
@@ -19,14 +20,18 @@ from lightning_pose.losses import LossConfig, PoseLoss
 from lightning_pose.metrics.pose_metrics import PoseMetrics
 from lightning_pose.models.parts.scaling import measure_columns, measure_poses
 from lightning_pose.models.parts.schedule import cosine_factor
+from lightning_pose.models.parts.world_frame import WorldFrame
 
 __all__ = ["Pose", "PoseModule"]
 
 Stage = Literal["train", "val", "test"]
 
+# Lightning notes that the module's hook is used although there is a data module, which is what is wanted.
+warnings.filterwarnings("ignore", message=".*overridden `on_before_batch_transfer` in `LightningModule`")
+
 
 class Pose(NamedTuple):
-    """Camera-to-world poses: `position_m` (..., 3) in metres, `quat_wxyz` (..., 4) unit."""
+    """Camera-to-world poses: `position_m` (..., 3) in metres or the scene's unit, `quat_wxyz` (..., 4) unit."""
 
     position_m: Tensor
     quat_wxyz: Tensor
@@ -56,6 +61,9 @@ class PoseModule(LightningModule):
 
     With `standardize`, the seven numbers are in standard deviations around the mean training pose; otherwise they are
     metres and quaternion components. The loss always compares metres and quaternion components.
+
+    Networks and losses see local positions, those of the world relative to an origin and a scale (`world_frame`).
+    `forward`, predictions and metrics are in the world, float64. `localize_batch` converts batches before a step.
 
     `ClosedFormModule` is the base class for networks that are solved instead of trained in steps; `models/parts/` has
     what else several architectures share.
@@ -115,6 +123,7 @@ class PoseModule(LightningModule):
         self.standardize = standardize
         self.standardize_features = standardize_features
         self.loss = PoseLoss(loss)
+        self.world_frame = WorldFrame(centred=not self.reads_clips)
         self.val_metrics = PoseMetrics()
         self.test_metrics = PoseMetrics()
         self.register_buffer("pose_mean", torch.zeros(7))
@@ -141,9 +150,9 @@ class PoseModule(LightningModule):
         return ("train",)
 
     def forward(self, features: Tensor) -> Pose:
-        """Features (B, *input_shape) -> poses of B frames."""
-        position_m, quat_raw = self.decode_features(features)
-        return Pose(position_m, quat_normalize(quat_raw))
+        """Features (B, *input_shape) -> poses of B frames in the world, positions in float64."""
+        position, quat_raw = self.decode_features(features)
+        return Pose(self.world_frame.to_world(position), quat_normalize(quat_raw))
 
     def decode_features(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Compute poses, as the losses of the thesis compare them.
@@ -152,7 +161,7 @@ class PoseModule(LightningModule):
             features: (B, *input_shape).
 
         Returns:
-            Positions (B, 3) in metres and quaternions (B, 4) not yet normalised.
+            Local positions (B, 3) and quaternions (B, 4) not yet normalised.
         """
         return self.unscale_pose(self.network(self.standardize_input(features)))
 
@@ -170,20 +179,20 @@ class PoseModule(LightningModule):
         return (features - self.feature_mean) / self.feature_scale
 
     def unscale_pose(self, pose: Tensor) -> tuple[Tensor, Tensor]:
-        """The network's (..., 7) numbers as positions (..., 3) in metres and quaternions (..., 4)."""
+        """The network's (..., 7) numbers as local positions (..., 3) and quaternions (..., 4)."""
         pose = pose * self.pose_scale + self.pose_mean
         return pose[..., :3], pose[..., 3:]
 
-    def fit_scale(self, position_m: Tensor, quat_wxyz: Tensor) -> None:
+    def fit_scale(self, position: Tensor, quat_wxyz: Tensor) -> None:
         """Learn the hemisphere of the targets, and with `standardize` their mean and spread.
 
         Args:
-            position_m: (M, 3) of training.
+            position: (M, 3) of training, local.
             quat_wxyz: (M, 4) of training.
         """
         self.quat_reference.copy_(mean_quat(quat_wxyz))
         if self.standardize:
-            mean, spread = measure_poses(position_m, quat_wxyz, self.quat_reference)
+            mean, spread = measure_poses(position, quat_wxyz, self.quat_reference)
             self.pose_mean.copy_(mean)
             self.pose_scale.copy_(spread)
 
@@ -218,24 +227,48 @@ class PoseModule(LightningModule):
             self.check_data(datamodule)
         if datamodule is not None and stage == "fit":
             train = datamodule.dataset("train")
-            self.fit_scale(*(part.to(self.device) for part in self.training_poses(train)))
+            self.fit_world_frame(train)
+            position_m, quat_wxyz = self.training_poses(train)
+            position = self.world_frame.to_local(position_m)
+            self.fit_scale(position.to(self.pose_mean), quat_wxyz.to(self.quat_reference))
             self.fit_feature_scale(train.data.features)
 
+    def fit_world_frame(self, train: PoseDataset) -> None:
+        """Choose the origin and the scale of the positions of the training split."""
+        self.world_frame.fit(train.data.position_m)
+
     def training_poses(self, train: PoseDataset) -> tuple[Tensor, Tensor]:
-        """Positions (M, 3) and quaternions (M, 4) that the network is to return in training; they set its scale."""
+        """Positions (M, 3) and quaternions (M, 4) that the network is to return in training; they set its scale.
+
+        Positions are in the world.
+        """
         return train.targets()
 
+    def localize_batch(self, batch: PoseBatch) -> PoseBatch:
+        """The same batch with local positions, float64, as steps and losses take it."""
+        return batch._replace(position_m=self.world_frame.to_local(batch.position_m))
+
+    def on_before_batch_transfer(self, batch: PoseBatch, dataloader_idx: int) -> PoseBatch:
+        batch = self.localize_batch(batch)
+        return batch._replace(position_m=batch.position_m.float()) if self.device.type == "mps" else batch
+
     def _step(self, batch: PoseBatch, stage: Stage) -> tuple[Tensor, Pose]:
-        """Decode a batch, compare it with the truth, and log; the same in training, validation and test."""
-        position_m, quat_raw = self.decode_batch(batch)
+        """Decode a localized batch, compare it with the truth, and log; for training, validation and test.
+
+        Returns:
+            the loss, and the poses in the world.
+        """
+        position, quat_raw = self.decode_batch(batch)
         target = align_hemisphere(batch.quat_wxyz, self.quat_reference)
-        terms = self.loss(position_m, quat_raw, batch.position_m, target)
+        terms = self.loss(position, quat_raw, batch.position_m.to(position.dtype), target)
         names = {f"{stage}/loss" if name == "total" else f"{stage}/loss_{name}": t for name, t in terms.items()}
         self.log_dict(names, on_step=False, on_epoch=True, batch_size=len(batch.frame))
-        pose = Pose(position_m, quat_normalize(quat_raw))
+        to_world = self.world_frame.to_world
+        pose = Pose(to_world(position.detach()), quat_normalize(quat_raw.detach()))
         if stage != "train":
             metrics = self.val_metrics if stage == "val" else self.test_metrics
-            metrics.update(*self.select_judged(pose), *self.select_judged(Pose(batch.position_m, batch.quat_wxyz)))
+            truth = Pose(to_world(batch.position_m), batch.quat_wxyz)
+            metrics.update(*self.select_judged(pose), *self.select_judged(truth))
         return terms["total"], pose
 
     def select_judged(self, pose: Pose) -> Pose:

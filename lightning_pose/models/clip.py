@@ -9,6 +9,7 @@ from torch import Tensor
 
 from lightning_pose.data.batches import PoseDataset
 from lightning_pose.data.clip_datamodule import require_clips
+from lightning_pose.data.clip_dataset import ClipDataset
 from lightning_pose.data.datamodule import SceneDataModule, scene_datamodule
 from lightning_pose.errors import ConfigError
 from lightning_pose.geometry.quaternions import quat_normalize, relative_pose
@@ -94,9 +95,16 @@ class ClipModule(PoseModule):
         if len(rows) > 1:
             self.motion_scale.copy_(rows.square().mean(0).sqrt().clamp(min=1e-6))
 
+    def fit_world_frame(self, train: PoseDataset) -> None:
+        """Choose the scale of the positions of the training split, each run of frames around its own mean."""
+        assert isinstance(train, ClipDataset)
+        runs = (train.data.position_m[torch.from_numpy(run)] for run in train.runs)
+        self.world_frame.fit(torch.cat([run - run.mean(0) for run in runs]))
+
     def training_poses(self, train: PoseDataset) -> tuple[Tensor, Tensor]:
         """Relative poses of all clips without their first frames, or with `integrate` those of each step."""
         position_m, quat_wxyz = train.targets()
+        quat_wxyz = quat_wxyz.to(position_m.dtype)
         if self.integrate:
             before = position_m[:, :-1], quat_wxyz[:, :-1]
             position_m, quat_wxyz = relative_pose(*before, position_m[:, 1:], quat_wxyz[:, 1:])

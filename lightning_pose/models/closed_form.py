@@ -160,7 +160,8 @@ class ClosedFormModule(PoseModule):
         total = 0.0
         for batch in self._batches("val"):
             target = align_hemisphere(batch.quat_wxyz, self.quat_reference)
-            loss = self.loss(*self.decode_features(batch.features), batch.position_m, target)["total"]
+            position, quat_raw = self.decode_features(batch.features)
+            loss = self.loss(position, quat_raw, batch.position_m.to(position.dtype), target)["total"]
             total += float(loss) * len(batch.frame)
         return total
 
@@ -171,7 +172,7 @@ class ClosedFormModule(PoseModule):
         return features, (poses - self.pose_mean) / self.pose_scale
 
     def _batches(self, split: str) -> Iterator[PoseBatch]:
-        """All frames of a split, in every process."""
-        data = scene_datamodule(self.trainer).dataset(split).data
+        """All frames of a split, localized, in every process."""
+        data = self.localize_batch(scene_datamodule(self.trainer).dataset(split).data)
         for parts in zip(*(tensor.split(_CHUNK) for tensor in data), strict=True):
             yield PoseBatch(*(part.to(self.device) for part in parts))

@@ -119,11 +119,13 @@ class NodePose(TrainingMemory, PoseModule):
     def setup(self, stage: str) -> None:
         super().setup(stage)
         if stage == "fit":
-            self.store_training(scene_datamodule(self.trainer).dataset("train").data)
+            self.store_training(self.localize_batch(scene_datamodule(self.trainer).dataset("train").data))
 
     def store_training(self, train: PoseBatch) -> None:
-        """Store the training images, once the scale of poses is known, and join them by edges."""
-        train = PoseBatch(*(tensor[train.frame.argsort()].to(self.device) for tensor in train))
+        """Store localized training images, once the scale of poses is known, and join them by edges."""
+        order = train.frame.argsort()
+        train = train._replace(position_m=train.position_m.to(self.pose_mean.dtype))
+        train = PoseBatch(*(tensor[order].to(self.device) for tensor in train))
         pose = torch.cat([train.position_m, align_hemisphere(train.quat_wxyz, self.quat_reference)], dim=-1)
         self.memory_features = train.features
         self.memory_pose = (pose - self.pose_mean) / self.pose_scale

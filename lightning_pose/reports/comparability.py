@@ -35,7 +35,7 @@ CAPTIONS = {
     "image_size": "images {}",
     "test_frames": "{} test frames",
 }
-FOLDERS = ("data.root", "data.train_scenes", "data.test_scenes")
+FOLDERS = ("data.root", "data.train_scenes", "data.test_scenes", "data.val_scenes", "data.pgt")
 """Settings that say where the data lie, and so name the same data in many ways."""
 
 

@@ -2,8 +2,9 @@
 
 `published_rows.csv` has the errors, one a line: medians in metres and degrees on the official test split (`cell`),
 and means over the seven scenes that the field quotes, with the original ground truth (`mean`). `published_scenes.csv`
-has the scenes, `published_remarks.csv` remarks by table, or by scene of tables 4.1 and 5.2. Numbers
-are as printed, but for three kinds of slips that the chapters themselves show:
+has the scenes, `published_remarks.csv` remarks by table, or by scene of tables 4.1 and 5.2. Tables 2.4, 2.5 and 3.3 are
+of recordings of TUM RGB-D and ICL-NUIM, which have no official split; the author's own data of table 2.4, which are not
+public, are left out. Numbers are as printed, but for three kinds of slips that the chapters themselves show:
 
 - Tables 2.3 and 3.2 name the scenes in another order than the later ones, yet seven of their rows from the literature
   are in the later order. These rows are read in that order.
@@ -32,7 +33,7 @@ SOURCE = (
     "University of Victoria"
 )
 SEVEN = 7
-GROUND_TRUTHS = {"7scenes": "original", "cambridge": "sfm"}
+GROUND_TRUTHS = {"7scenes": "original", "cambridge": "sfm", "tum": "original", "icl_nuim": "synthetic"}
 """What the published errors of a dataset were measured against."""
 
 
@@ -42,15 +43,26 @@ def _read_csv(name: str) -> list[dict[str, str]]:
     return list(csv.DictReader(text.splitlines()))
 
 
-SCENES = {line["folder"]: line["name"] for line in _read_csv("published_scenes")}
-"""Folders of the datasets, in small letters without spaces, hyphens and underscores, to names of scenes in the rows."""
+WITH_SPLITS = ("7scenes", "cambridge")
+"""Datasets with official splits."""
 
-FRAMES = {line["name"]: int(line["test_frames"]) for line in _read_csv("published_scenes")}
+SCENES = {line["folder"]: line["name"] for line in _read_csv("published_scenes") if line["dataset"] in WITH_SPLITS}
+"""Folders of these, in small letters without spaces, hyphens and underscores, to names of scenes in the rows."""
+
+FRAMES = {
+    line["name"]: int(line["test_frames"]) for line in _read_csv("published_scenes") if line["dataset"] in WITH_SPLITS
+}
 """Test frames of the official splits."""
+
+RECORDINGS = {(line["dataset"], line["folder"]): line["name"] for line in _read_csv("published_scenes")}
+"""The same for all datasets: (dataset, folder) to names; `rgbd_dataset_freiburg1_xyz` of TUM RGB-D is `fr1xyz`."""
+
+RECORDED_FRAMES = {line["name"]: line["test_frames"] for line in _read_csv("published_scenes")}
+"""Test frames as table 2.4 counts them, which are of no official split; empty where the thesis gives none."""
 
 
 def read_published(chapters: Iterable[int] = CHAPTERS) -> dict[tuple[str, str, str], dict[str, Cell]]:
-    """The rows of the thesis's tables 2.3, 3.2, 4.1, 5.2 and 6.1.
+    """The rows of the thesis's tables 2.3, 2.4, 2.5, 3.2, 3.3, 4.1, 5.2 and 6.1.
 
     Args:
         chapters: whose tables.
@@ -77,7 +89,8 @@ def add_published(report: Report, chapters: Sequence[int] = ()) -> None:
     if not columns:
         report.notes.append(
             f"no published row: none of the scenes on show ({', '.join(report.scenes)}) is one of 7-Scenes "
-            f"or Cambridge with its original ground truth ({', '.join(SCENES)})"
+            "or Cambridge, or of the thesis's recordings of TUM RGB-D or ICL-NUIM, with its original ground truth "
+            f"({', '.join(dict.fromkeys(RECORDINGS.values()))})"
         )
         return
     rows: dict[tuple[object, ...], Row] = {}
@@ -112,10 +125,14 @@ def _published_cell(line: Mapping[str, str]) -> Cell:
 def _published_name(report: Report, scene: str) -> str | None:
     """The published name of a scene on show; that of the scene tested on, for a model trained elsewhere."""
     facts = report.facts[scene]
-    truth = GROUND_TRUTHS.get(find_tested_fact(scene, facts, "dataset") or "7scenes")
+    dataset = find_tested_fact(scene, facts, "dataset") or "7scenes"
+    truth = GROUND_TRUTHS.get(dataset)
     if truth is None or (find_tested_fact(scene, facts, "ground_truth") or truth) != truth:
         return None
-    return SCENES.get(re.sub("[ _-]", "", scene.rpartition(" to ")[2].lower()))
+    folder = re.sub("[ _-]", "", scene.rpartition(" to ")[2].lower())
+    if dataset in WITH_SPLITS:
+        return SCENES.get(folder)
+    return RECORDINGS.get((dataset, folder.removeprefix("rgbddataset").replace("freiburg", "fr")))
 
 
 def _mean_rows(report: Report, columns: dict[str, str]) -> list[Row]:
@@ -140,11 +157,15 @@ def _compare_scenes(report: Report, columns: dict[str, str]) -> str:
     reasons = [why for scene, name in columns.items() for why in _list_differences(scene, name, report.facts[scene])]
     if not reasons:
         return "published rows are of the same official test frames; image sizes and training may differ"
-    return f"published rows are of the whole official test split and do not compare: {'; '.join(reasons)}"
+    official = " are of the whole official test split and" if set(columns.values()) & set(FRAMES) else ""
+    return f"published rows{official} do not compare: {'; '.join(reasons)}"
 
 
 def _list_differences(scene: str, name: str, facts: Mapping[str, str]) -> list[str]:
     """What keeps the errors on a scene from comparing with published ones."""
+    if name not in FRAMES:
+        count = f" {RECORDED_FRAMES[name]}" if RECORDED_FRAMES[name] else ""
+        return [f"{scene} has no official split, and the thesis does not say which{count} frames of it were tested"]
     reasons = []
     frames, whole = facts.get("test_frames"), str(FRAMES[name])
     # A scene that was only tested on has the frames of its official split, and the split `unseen`.

@@ -25,8 +25,8 @@ __all__ = ["SEVEN_SCENES", "STANDARD_DEVIATIONS", "Cell", "Report", "Row", "add_
 SEVEN_SCENES = ("chess", "fire", "heads", "office", "pumpkin", "redkitchen", "stairs")
 STANDARD_DEVIATIONS = ("position_std_m", "orientation_std_deg")
 SETTINGS_OF_SCENES = (
-    "scene", "data.root", "data.format", "data.room_seed", "data.train_scenes", "data.test_scenes", "data.train_rooms",
-    "data.test_rooms",
+    "scene", "data.root", "data.format", "data.room_seed", "data.train_scenes", "data.test_scenes", "data.val_scenes",
+    "data.pgt", "data.train_rooms", "data.test_rooms",
 )  # fmt: skip
 NO_MEAN = ("unit", "task", "relative_frame")
 """Facts in which scenes must not differ for their errors to have a mean."""

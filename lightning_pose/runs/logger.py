@@ -209,12 +209,14 @@ def find_last_run(
 
     client = MlflowClient(uri)
     experiment = client.get_experiment_by_name(experiment_name)
-    scenes = " and ".join(f'params.`data.{name}` = "{value}"' for name, value in data.items())
-    query = f"tags.architecture = '{architecture}' and {scenes}"
+    named = (f'params.`data.{name}` = "{value}"' for name, value in data.items() if value is not None)
+    query = " and ".join([f"tags.architecture = '{architecture}'", *named])
     runs = client.search_runs([experiment.experiment_id], query) if experiment else []  # newest first
     for run in runs:
+        # Older runs lack settings that are new since; None is their default.
+        alike = all(run.data.params.get(f"data.{name}", "None") == str(value) for name, value in data.items())
         checkpoint = checkpoints / run.info.run_id / "last.ckpt"
-        if checkpoint.is_file():
+        if alike and checkpoint.is_file():
             return run.info.run_id, checkpoint
     scene = " ".join(f"data.{name}={value}" for name, value in data.items())
     raise CheckpointError(

@@ -27,6 +27,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from lightning_pose.errors import ConfigError, DataError
+from lightning_pose.scenes.gaps import find_run_starts
 from lightning_pose.scenes.scene import Scene
 
 __all__ = ["hold_out", "make_splits"]
@@ -56,16 +57,22 @@ def make_splits(
     if not scene.frames:
         raise DataError(f"{scene.root} holds no posed image; check that the download is complete")
     sequences = np.array([frame.sequence for frame in scene.frames])
+    runs = np.cumsum(find_run_starts(scene))
     if scene.splits:
         train, test = scene.splits["train"], scene.splits["test"]
     else:
-        train, test = hold_out(np.arange(len(sequences)), sequences, test_fraction, "test_fraction")
-    train, val = hold_out(train, sequences, val_fraction, "val_fraction", val_block)
+        train, test = hold_out(np.arange(len(sequences)), sequences, test_fraction, "test_fraction", runs=runs)
+    train, val = hold_out(train, sequences, val_fraction, "val_fraction", val_block, runs)
     return {"train": train, "val": val, "test": test}
 
 
 def hold_out(
-    indices: np.ndarray, sequences: np.ndarray, fraction: float, setting: str, block: int = 1
+    indices: np.ndarray,
+    sequences: np.ndarray,
+    fraction: float,
+    setting: str,
+    block: int = 1,
+    runs: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Divide frames into those kept and those held out.
 
@@ -76,6 +83,7 @@ def hold_out(
         setting: name of the fraction in the user's settings, for the message.
         block: least number of consecutive frames to hold out (clips need them), if sequences are that long; whole
             sequences or longer blocks are chosen where halves are shorter.
+        runs: the run of consecutive frames that every frame of the scene is in; its sequence if not given.
 
     Returns:
         the kept and the held-out indices, ascending.
@@ -94,7 +102,7 @@ def hold_out(
     if held is None:
         held = _choose_sequences(indices, sequences[indices], wanted, block)
     if held is None:
-        held = _choose_blocks(indices, sequences, wanted, block)
+        held = _choose_blocks(indices, sequences if runs is None else runs, wanted, block)
     return np.setdiff1d(indices, held), held
 
 
@@ -139,9 +147,9 @@ def _count_sequences(sequence_of: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return names[order], lengths[order]
 
 
-def _choose_blocks(indices: np.ndarray, sequences: np.ndarray, wanted: int, block: int) -> np.ndarray:
+def _choose_blocks(indices: np.ndarray, run_of: np.ndarray, wanted: int, block: int) -> np.ndarray:
     """Evenly spaced blocks, `wanted` frames together, none of them across a gap or the end of a sequence."""
-    breaks = np.flatnonzero((np.diff(indices) > 1) | (sequences[indices[1:]] != sequences[indices[:-1]])) + 1
+    breaks = np.flatnonzero((np.diff(indices) > 1) | (run_of[indices[1:]] != run_of[indices[:-1]])) + 1
     runs = np.array([0, *breaks, len(indices)])
     count = min(max(wanted // max(MIN_BLOCK, block), 1), MAX_BLOCKS)
     lengths = [max(block, len(part)) for part in np.array_split(np.arange(wanted), count)]

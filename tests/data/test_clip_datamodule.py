@@ -62,7 +62,7 @@ def test_batches_have_features_and_relative_poses(scene: Path) -> None:
             for name in ("position_m", "quat_wxyz")
         )
         expected = relative_poses(positions, quats)
-        torch.testing.assert_close(batch.position_m, expected[0], atol=1e-5, rtol=1e-5)
+        torch.testing.assert_close(batch.position_m, expected[0].double(), atol=1e-5, rtol=1e-5)
         assert (batch.frame.diff(dim=1) == 2).all()
 
 

@@ -33,7 +33,8 @@ def test_features_and_poses_belong_together(scene: Path) -> None:
     data.prepare_data()
     for split in ("train", "val", "test"):
         batch = data.dataset(split).data
-        assert batch.features.dtype == batch.position_m.dtype == batch.quat_wxyz.dtype == torch.float32
+        assert batch.features.dtype == batch.quat_wxyz.dtype == torch.float32
+        assert batch.position_m.dtype == torch.float64
         for row, index in enumerate(batch.frame.tolist()):
             frame = data.scene.frames[index]
             (record,) = data.extractor.extract([read_gray(frame.image)])

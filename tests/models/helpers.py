@@ -116,6 +116,7 @@ class LearnableProblem(SceneDataModule):
 
     def __init__(self, input_shape: list[int], count: int = 24) -> None:
         SceneDataModule.__init__(self, Thumbnails(), 8, 8, cache_dir=None, workers=None)  # the extractor is not used
+        self.count = count  # a checkpoint names the settings of its data
         poses = {split: random_poses(count, seed) for split, seed in _SEEDS.items()}
         train = torch.cat(poses["train"], dim=-1)
         mix = torch.randn(7, math.prod(input_shape), generator=torch.Generator().manual_seed(1)) / 7**0.5

@@ -50,7 +50,7 @@ def test_poses_that_are_all_equal_have_a_scale() -> None:
     model.fit_scale(torch.ones(3, 3), torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(3, 1))
     assert (model.pose_scale > 0).all()
     position_m, _ = model.eval()(torch.zeros(1, *model.input_shape))
-    torch.testing.assert_close(position_m, torch.ones(1, 3), atol=1e-4, rtol=0)
+    torch.testing.assert_close(position_m.float(), torch.ones(1, 3), atol=1e-4, rtol=0)
 
 
 def test_signs_of_quaternions_do_not_matter(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -62,10 +62,10 @@ def test_integrated_steps_begin_at_the_origin_and_add_up(network: type[ClipModul
     model = make(network, integrate=True).eval()
     features = torch.randn(1, 5, 6, 12)
     position_m, quat_wxyz = model(features)
-    torch.testing.assert_close(position_m[:, 0], torch.zeros(1, 3))
+    torch.testing.assert_close(position_m[:, 0], torch.zeros(1, 3).double())
     torch.testing.assert_close(quat_wxyz[:, 0], torch.eye(4)[:1])
     steps, _ = model.unscale_pose(model.network(model.standardize_input(features).unsqueeze(2)))
-    torch.testing.assert_close(position_m[:, 1], steps[:, 1])
+    torch.testing.assert_close(position_m[:, 1], steps[:, 1].double())
 
 
 def test_integrated_networks_learn_the_scale_of_steps_and_others_that_of_clips() -> None:

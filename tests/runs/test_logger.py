@@ -169,6 +169,15 @@ def test_the_last_run_is_the_newest_of_that_architecture_and_scene(trained: Trai
         find("SurfLSTM", "elsewhere")
 
 
+def test_a_run_that_lacks_a_newer_setting_is_found_by_its_default(trained: Trained) -> None:
+    checkpoints = trained.workplace.folder / "mlruns" / "checkpoints"
+    data = {"root": str(trained.workplace.scene), "newer": None}
+    found = find_last_run(trained.workplace.uri, "lightning_pose", checkpoints, "SurfLSTM", data)
+    assert found == (trained.run.info.run_id, trained.last)
+    with pytest.raises(CheckpointError, match=r"data\.newer=set"):
+        find_last_run(trained.workplace.uri, "lightning_pose", checkpoints, "SurfLSTM", data | {"newer": "set"})
+
+
 def test_no_experiment_has_no_last_run(workplace: Workplace) -> None:
     with pytest.raises(CheckpointError, match="no run of SurfLSTM"):
         find_last_run(workplace.uri, "lightning_pose", workplace.folder, "SurfLSTM", {"root": None})
