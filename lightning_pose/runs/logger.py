@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 from lightning.fabric.utilities.rank_zero import rank_zero_only
 from lightning.pytorch.loggers import MLFlowLogger
 
+from lightning_pose.checkpoint import find_class_paths, read_checkpoint
 from lightning_pose.errors import CheckpointError
 from lightning_pose.paths import STORE_VARIABLE, default_tracking_uri
 from lightning_pose.runs.process import has_owner_died, process_tags
@@ -223,8 +224,16 @@ def find_last_run(
 
 
 def log_localizer(logger: MLflowLogger, checkpoint: Path) -> None:
-    """Log a localizer to the run as `model`, for `mlflow.pyfunc.load_model`."""
+    """Log a localizer to the run as `model`, for `mlflow.pyfunc.load_model`.
+
+    Args:
+        logger: of the run.
+        checkpoint: that the run has written; the model may import the classes of the user's own that it names.
+    """
     import mlflow
+
+    named = find_class_paths(read_checkpoint(checkpoint)["lightning_pose"])
+    allow = [path for path in named if "." in path and not path.startswith(f"{PACKAGE.name}.")]
 
     os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
     # Messages on pip, which uv lacks, on type hints of tables, and on a lock file that MLflow copies.
@@ -239,6 +248,7 @@ def log_localizer(logger: MLflowLogger, checkpoint: Path) -> None:
                 name="model",
                 python_model=str(PACKAGE / "localization" / "mlflow_model.py"),
                 artifacts={"checkpoint": str(checkpoint)},
+                model_config={"allow": allow},
                 code_paths=[str(PACKAGE)],
                 pip_requirements=[f"{name}=={version(name)}" for name in REQUIREMENTS],
             )

@@ -17,7 +17,7 @@ from tests.helpers import Thumbnails, Trained
 
 @pytest.fixture
 def localizer(trained: Trained) -> Localizer:
-    return Localizer.from_checkpoint(trained.best)
+    return Localizer.from_checkpoint(trained.best, allow="tests")
 
 
 @pytest.fixture
