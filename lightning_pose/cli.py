@@ -6,7 +6,6 @@ import argparse
 import contextlib
 import json
 import logging
-import re
 import warnings
 from itertools import pairwise
 from pathlib import Path
@@ -27,6 +26,7 @@ from lightning_pose.checkpoint import (
     resolve_class_path,
     resolve_class_paths,
 )
+from lightning_pose.commands.setting_errors import REMEDY, explain_setting_error
 from lightning_pose.data import SceneDataModule, require_clips
 from lightning_pose.errors import CheckpointError, ConfigError
 from lightning_pose.evaluation.callback import TestReport
@@ -75,27 +75,11 @@ class PoseParser(LightningArgumentParser):
         super().__init__(*args, **settings)
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
-        raise ConfigError(_one_line(message)) from ex
+        raise ConfigError(explain_setting_error(message)) from ex
 
 
 SCENES = ("root", "train_scenes")
 """Settings of the data modules that say what a run trains on."""
-
-REMEDY = "`python -m lightning_pose fit --help` explains every setting"
-NOISE = re.compile(
-    r"Does not validate against any of the Union subtypes|Subtypes: .*|Errors:|Expected a <class 'NoneType'>"
-    r"|Given value type: .*|Given value: (NestedArg|Namespace|\{).*"
-)
-
-
-def _one_line(message: str) -> str:
-    """jsonargparse's message in one line, without its notes on types: which setting, and what is wrong with it."""
-    lines = [NOISE.sub("", line).strip(" -") for line in message.splitlines()]
-    text = " ".join(line for line in lines if line)
-    text = re.sub(r"<class '([^']+)'>", r"\1", re.sub(r'Parser key "([^"]+)":', r"\1:", text))
-    # A nested parser's message comes through here twice.
-    return text if text.endswith(REMEDY) else f"{text}; {REMEDY}"
-
 
 HELP = {
     "fit": """Train a localizer, test its best checkpoint, and print it beside its baselines.
@@ -188,7 +172,7 @@ class PoseCLI(LightningCLI):
             parser_kwargs={verb: _parser_settings(verb) for verb in self.subcommands()}
             if run
             else _parser_settings("extract"),
-            args=_with_saved_config(args) if run else args,
+            args=_with_saved_config(args) if run else _require_config("extract", args),
             run=run,
         )
 
@@ -218,7 +202,7 @@ class PoseCLI(LightningCLI):
         except ValueError as error:
             # jsonargparse wraps what a constructor refuses; the constructor's own words are among its lines.
             if str(error).startswith("Does not validate"):
-                raise ConfigError(_one_line(str(error))) from error
+                raise ConfigError(explain_setting_error(str(error))) from error
             raise
         self.model.check_data(self.datamodule)
 
@@ -301,8 +285,10 @@ def _with_saved_config(args: list[str]) -> list[str]:
     parser.add_argument("--allow", action="append", default=[])
     options, rest = parser.parse_known_args(args[1:])
     asks = any(word == "-h" or "help" in word or word.startswith("--print_config") for word in rest)
-    if args[0] == "fit" or asks:
+    if asks:
         return args
+    if args[0] == "fit":
+        return _require_config("fit", args)
     if options.ckpt_path is None:
         raise ConfigError(f"{args[0]} needs a checkpoint; give it with --ckpt_path")
     named = [*options.allow, *_list_named_classes(options.config, rest)]
@@ -315,6 +301,22 @@ def _with_saved_config(args: list[str]) -> list[str]:
     settings = {"model": model} | ({} if options.config or data is None else {"data": data})
     configs = [word for text in (*options.config, json.dumps(settings)) for word in ("--config", text)]
     return [args[0], *configs, *rest, "--ckpt_path", options.ckpt_path]
+
+
+def _require_config(verb: str, args: list[str]) -> list[str]:
+    """The command line, if it gives a config, an architecture and data, or asks for help.
+
+    Raises:
+        ConfigError: it does not, so that no other option can be understood.
+    """
+    names = {word.partition("=")[0] for word in args}
+    asks = any(word == "-h" or "help" in word or word.startswith("--print_config") for word in args)
+    if not asks and not names & {"--config", "-c"} and not {"--model", "--data"} <= names:
+        raise ConfigError(
+            f"{verb} needs a config, which says what to train and on which data; give one with --config, such as "
+            "configs/quickstart.yaml, or configs/surf_lstm.yaml with --data.root DIR"
+        )
+    return args
 
 
 def _list_named_classes(configs: list[str], words: list[str]) -> list[str]:

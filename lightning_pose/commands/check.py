@@ -33,7 +33,7 @@ def main(argv: list[str]) -> int:
         PoseError: the dataset cannot be read at all.
     """
     args = _build_check_parser().parse_args(argv)
-    console = Console()
+    console = Console(markup=False, emoji=False)  # names of scenes are not markup
     scene = load_scene(args.dir, args.format)
     reading = track(read_image_files(scene), "reading images", len(scene.frames), console=console, transient=True)
     files = list(reading)

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import torch
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
 from lightning_pose.errors import ImageError
@@ -180,7 +180,7 @@ class _RateColumn(ProgressColumn):
 def _make_extraction_bar(shown: bool) -> Progress:
     """A progress bar on stderr, with images per second."""
     return Progress(
-        "{task.description}",
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         _RateColumn(),

@@ -63,11 +63,14 @@ class Localizer:
         clips = (data["clip_length"], data["relative_frame"]) if model.reads_clips else None
         return cls(build_object(data["extractor"], allow, "lightning_pose.features"), model, clips)
 
-    def __call__(self, images: Sequence[str | Path | np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    def __call__(
+        self, images: str | Path | np.ndarray | Sequence[str | Path | np.ndarray]
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Locate images.
 
         Args:
-            images: M files, or uint8 arrays as `extractor.color` asks for: (H, W) gray or (H, W, 3) RGB.
+            images: M files, or uint8 arrays as `extractor.color` asks for: (H, W) gray or (H, W, 3) RGB. One image
+                may stand alone, and is a list of one.
 
         Returns:
             position_m (M, 3) and quat_wxyz (M, 4), camera-to-world. For a model of clips the images are one video, in
@@ -76,10 +79,14 @@ class Localizer:
         Raises:
             ImageError: an image cannot be read.
         """
-        read = self.extractor.read
-        arrays = [image if isinstance(image, np.ndarray) else read(image) for image in images]
-        records = self.extractor.extract(arrays)
-        features = torch.from_numpy(np.stack([self.extractor.features(record) for record in records]))
+        extractor, axes = self.extractor, 2 if self.extractor.color == "gray" else 3
+        if isinstance(images, str | Path) or (isinstance(images, np.ndarray) and images.ndim == axes):
+            images = [images]
+        arrays = [image if isinstance(image, np.ndarray) else extractor.read(image) for image in images]
+        if not arrays:
+            return np.zeros((0, 3), np.float32), np.zeros((0, 4), np.float32)
+        records = extractor.extract(arrays)
+        features = torch.from_numpy(np.stack([extractor.features(record) for record in records]))
         if self.clips is not None:
             chained = locate_sequence(self.model, features, *self.clips)
             return chained[0].numpy(), chained[1].numpy()
