@@ -18,8 +18,8 @@ GIVEN = re.compile(r"\b(?:Given|Got) value: (.*)")
 REQUIRED = re.compile(r"the following arguments are required: (.*)")
 KINDS = {
     "bool": "true or false",
-    "int": "a whole number",
-    "float": "a number",
+    "int": "a whole number (int)",
+    "float": "a number (float)",
     "str": "a text",
     "list": "a list",
     "tuple": "a list",
@@ -46,6 +46,8 @@ def explain_setting_error(message: str) -> str:
     text = " ".join(GIVEN.sub("", EXPECTED.sub("", text)).split()).rstrip(" .;")
     if kinds and not re.search(r"is not accepted|Problem with|not found|: give ", text):
         text = f"{text} give {' or '.join(kinds)}{f', not {given[1].strip()}' if given else ''}"
+    elif given and given[1].strip() not in text:
+        text = re.sub(r"^((?:[\w.]+: )*)", lambda keys: f"{keys[1]}{given[1].strip()}: ", text)
     required = REQUIRED.fullmatch(text)
     if required:
         names = " and no ".join(name.rpartition(".")[2] for name in required[1].split(", "))
@@ -62,5 +64,5 @@ def _name_kind(kind: str) -> str:
     """What users write for a type that jsonargparse names."""
     name = re.sub(r"<class '([^']+)'>", r"\1", kind)
     if name.startswith("typing.Literal["):
-        return "one of " + name.removeprefix("typing.Literal[").removesuffix("]").replace("'", "")
+        return "one of " + name.removeprefix("typing.Literal[").removesuffix("]")
     return KINDS.get(name, f"a {name.rpartition('.')[2]}")

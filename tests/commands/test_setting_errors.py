@@ -23,10 +23,18 @@ UNION = """Parser key "trainer.logger":
     ("message", "line"),
     [
         (UNION, "trainer.logger: give the class path of a class or a list or true or false, not 5"),
-        ("Parser key \"data\":\n  val_fraction: Expected a <class 'float'>. Got value: x", "give a number, not x"),
+        (
+            "Parser key \"data\":\n  val_fraction: Expected a <class 'float'>. Got value: x",
+            "give a number (float), not x",
+        ),
         (
             "model: form: Expected a typing.Literal['joint', 'split']. Got value: bad",
-            "give one of joint, split, not bad",
+            "give one of 'joint', 'split', not bad",
+        ),
+        (
+            "model:\n  - Expected a path but a.B either not accessible or invalid\n  Import path does not correspond to a"
+            " subclass of PoseModule\n - Expected a <class 'NoneType'>\n Given value: a.B",
+            "model: a.B: Import path does not correspond to a subclass of PoseModule",
         ),
         ("data: Option 'root' is not accepted", "data: Option 'root' is not accepted"),
         (

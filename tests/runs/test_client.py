@@ -123,5 +123,6 @@ def test_training_goes_on_without_its_store(
     assert workplace.run("fit") == 0
     assert "oracle" in capsys.readouterr().out
     (run,) = workplace.runs()
-    assert run.info.run_name == "SurfLSTM wall N=6 seed=0"
+    assert run.info.run_name == "SurfLSTM wall N=6"
+    assert run.info.status == "FINISHED"
     assert {"train/loss", "val/loss", "test/position_median_m"} <= run.data.metrics.keys()
