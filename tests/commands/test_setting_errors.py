@@ -32,8 +32,8 @@ UNION = """Parser key "trainer.logger":
             "give one of 'joint', 'split', not bad",
         ),
         (
-            "model:\n  - Expected a path but a.B either not accessible or invalid\n  Import path does not correspond to a"
-            " subclass of PoseModule\n - Expected a <class 'NoneType'>\n Given value: a.B",
+            "model:\n  - Expected a path but a.B either not accessible or invalid\n  Import path does not correspond to"
+            " a subclass of PoseModule\n - Expected a <class 'NoneType'>\n Given value: a.B",
             "model: a.B: Import path does not correspond to a subclass of PoseModule",
         ),
         ("data: Option 'root' is not accepted", "data: Option 'root' is not accepted"),
