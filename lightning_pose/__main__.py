@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import errno
 import sys
 from importlib import import_module
 
@@ -24,6 +25,9 @@ VERBS = {
     "check": ("lightning_pose.commands.check", "say what a dataset holds, and what is wrong with it"),
     "synth": ("lightning_pose.commands.synth", "render a synthetic room as a dataset"),
 }
+
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
+"""Numbers of the operating system's errors for a disk that is full, or that takes no file."""
 
 USAGE = """usage: python -m lightning_pose VERB [options]
 
@@ -61,6 +65,15 @@ def main(argv: list[str] | None = None) -> int:
         return import_module(VERBS[verb][0]).main(argv if verb in LIGHTNING_VERBS else argv[1:])
     except PoseError as error:
         print(f"error: {error}", file=sys.stderr)
+        return 2
+    except OSError as error:
+        if error.errno not in FULL:
+            raise
+        print(
+            f"error: {error.filename or 'a file'} cannot be written ({error.strerror}); free some space, or choose "
+            "another folder",
+            file=sys.stderr,
+        )
         return 2
     except KeyboardInterrupt as stop:
         print("; ".join(["interrupted", *map(str, stop.args)]), file=sys.stderr)

@@ -2,13 +2,18 @@
 
 A spec is what config files write: `describe_object` makes it from an object, `build_object` the object from it.
 `read_checkpoint` reads a file that `fit` wrote; class paths of older versions are replaced by today's.
+
+A checkpoint may come from a stranger, so that no class in it is imported unless this package has it, as an
+architecture, a feature extractor or a data module, or the user allows it by name.
 """
 
 from __future__ import annotations
 
 import inspect
+import re
 import sys
-from collections.abc import Mapping
+import zipfile
+from collections.abc import Iterable, Mapping
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -21,8 +26,11 @@ __all__ = [
     "RENAMED_CLASSES",
     "Spec",
     "build_object",
+    "check_file",
+    "check_specs",
     "class_path",
     "describe_object",
+    "find_class_paths",
     "read_checkpoint",
     "resolve_class_path",
     "resolve_class_paths",
@@ -100,39 +108,196 @@ def describe_object(obj: object) -> Spec:
     return {"class_path": class_path(obj), "init_args": {name: getattr(obj, name) for name in names}}
 
 
-def build_object(spec: Mapping[str, Any]) -> Any:
+BASES = {
+    "lightning_pose.models": "PoseModule",
+    "lightning_pose.features": "FeatureExtractor",
+    "lightning_pose.data": "SceneDataModule",
+}
+"""Packages whose classes a checkpoint may name, and the class that each of these must be a subclass of."""
+
+
+def build_object(spec: Mapping[str, Any], allow: str | Iterable[str] = (), package: str | None = None) -> Any:
     """Make the object that a spec describes.
 
+    Args:
+        spec: of a checkpoint.
+        allow: class paths, or packages, of the user's own classes that the spec may name.
+        package: of `BASES`, whose base class the object must have; any of them by default.
+
     Raises:
-        CheckpointError: the class cannot be imported here, or does not take these arguments.
+        CheckpointError: the class is neither this package's nor allowed, it cannot be imported here, or does not
+            take these arguments.
     """
-    path = resolve_class_path(spec["class_path"])
-    module, _, name = path.rpartition(".")
+    spec = _check_spec(spec, _list_allowed(allow))
+    path = spec["class_path"]
+    cls = _import_class(path, (package,) if package else tuple(BASES))
     try:
-        return getattr(import_module(module), name)(**spec["init_args"])
-    except (ImportError, AttributeError, ValueError) as error:
-        raise CheckpointError(f"{path} cannot be imported ({error}); install the package that has it") from error
-    except TypeError as error:
+        return cls(**spec["init_args"])
+    except (TypeError, ValueError, RuntimeError, AttributeError) as error:
         raise CheckpointError(
             f"{path} does not take the saved settings ({error}); it was saved by another version, train it again"
         ) from error
 
 
+def check_specs(specs: object, allow: str | Iterable[str] = ()) -> dict[str, Spec | None]:
+    """Check what a checkpoint says of its `model` and its `data`, without importing a class that is not allowed.
+
+    Args:
+        specs: a checkpoint's `lightning_pose`.
+        allow: as for `build_object`.
+
+    Returns:
+        Specs of `model` and of `data` with its `extractor`, without anything else; `data` is None where there was no
+        data module.
+
+    Raises:
+        CheckpointError: as `build_object`, or a spec is malformed.
+    """
+    if not isinstance(specs, Mapping) or "model" not in specs:
+        raise CheckpointError("the checkpoint does not say which architecture it holds; train it again")
+    allow = _list_allowed(allow)
+    model = _check_spec(specs["model"], allow)
+    _import_class(model["class_path"], ("lightning_pose.models",))
+    data = specs.get("data")
+    if data is None:
+        return {"model": model, "data": None}
+    arguments = data.get("init_args") if isinstance(data, Mapping) else None
+    if not isinstance(arguments, Mapping) or "extractor" not in arguments:
+        raise CheckpointError("the checkpoint does not say which features it reads; train it again")
+    extractor = _check_spec(arguments["extractor"], allow)
+    _import_class(extractor["class_path"], ("lightning_pose.features",))
+    others = {name: value for name, value in arguments.items() if name != "extractor"}
+    data = _check_spec({"class_path": data.get("class_path"), "init_args": others}, allow)
+    _import_class(data["class_path"], ("lightning_pose.data",))
+    data["init_args"]["extractor"] = extractor
+    return {"model": model, "data": data}
+
+
+CLASS_SETTINGS = ("class_path", "model", "data", "extractor", "backbone")
+"""Names of settings whose value may be a class path."""
+
+
+def find_class_paths(settings: object) -> list[str]:
+    """All texts that nested settings give for one of `CLASS_SETTINGS`."""
+    found: list[str] = []
+    if isinstance(settings, Mapping):
+        found = [text for name, text in settings.items() if name in CLASS_SETTINGS and isinstance(text, str)]
+        settings = list(settings.values())
+    if isinstance(settings, list):
+        found += [text for inner in settings for text in find_class_paths(inner)]
+    return found
+
+
+def _list_allowed(allow: str | Iterable[str]) -> tuple[str, ...]:
+    """Allowed class paths, of which one may stand alone, by their names of today."""
+    return tuple(map(resolve_class_path, (allow,) if isinstance(allow, str) else allow))
+
+
+def _check_spec(spec: object, allow: tuple[str, ...]) -> Spec:
+    """A spec's class path and arguments, checked; its class path is today's.
+
+    Raises:
+        CheckpointError: as `check_specs`.
+    """
+    if not isinstance(spec, Mapping) or not isinstance(spec.get("class_path"), str):
+        raise CheckpointError(f"the checkpoint holds {str(spec)[:80]!r} in place of a class and its settings")
+    path, arguments = resolve_class_path(spec["class_path"]), spec.get("init_args", {})
+    if not isinstance(arguments, Mapping) or not all(isinstance(name, str) for name in arguments):
+        raise CheckpointError(f"the checkpoint holds no settings of {path}; train it again")
+    if _mentions_class(arguments):
+        raise CheckpointError(f"the checkpoint's settings of {path} name further classes, as `fit` never writes them")
+    backbone = arguments.get("backbone")
+    for named in (path, backbone):
+        if isinstance(named, str) and not _is_trusted(named, named is backbone, allow):
+            raise CheckpointError(
+                f"the checkpoint names {named}, which is not this package's; reading it would run code from there. "
+                f"If you trust it, give --allow {named}, or in Python allow=[{named!r}]"
+            )
+    return {"class_path": path, "init_args": dict(arguments)}
+
+
+def _mentions_class(value: object) -> bool:
+    """Whether nested settings hold the spec of a class, or a dotted name, which the command line would take for one."""
+    if isinstance(value, Mapping):
+        return any(name == "class_path" or "." in str(name) or _mentions_class(inner) for name, inner in value.items())
+    return isinstance(value, list | tuple) and any(_mentions_class(inner) for inner in value)
+
+
+def _is_trusted(path: str, is_backbone: bool, allow: tuple[str, ...]) -> bool:
+    """Whether a checkpoint may name this class, or this network of a `backbone` setting."""
+    if any(path == name or path.startswith(f"{name}.") for name in allow):
+        return True
+    if is_backbone:
+        return "." not in path or _is_torchvision_network(path)
+    return any(path.startswith(f"{package}.") for package in BASES)
+
+
+def _is_torchvision_network(path: str) -> bool:
+    """Whether a path names one of the networks that torchvision lists."""
+    if not re.fullmatch(r"torchvision\.models(\.\w+)+", path):
+        return False
+    from torchvision import models  # a second to import, and few need it
+
+    module, _, name = path.rpartition(".")
+    return name in models.list_models() and models.get_model_builder(name).__module__.startswith(module)
+
+
+def _import_class(path: str, packages: Iterable[str]) -> type:
+    """Import a class that must have the base class of one of these packages.
+
+    Raises:
+        CheckpointError: it cannot be imported, or is something else.
+    """
+    module, _, name = path.rpartition(".")
+    try:
+        found = getattr(import_module(module), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise CheckpointError(f"{path} cannot be imported ({error}); install the package that has it") from error
+    bases = tuple(getattr(import_module(package), BASES[package]) for package in packages)
+    if not isinstance(found, type) or not issubclass(found, bases):
+        raise CheckpointError(f"{path} is no {' or '.join(base.__name__ for base in bases)}, as `fit` would name it")
+    return found
+
+
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
     """Read a checkpoint that `fit` wrote: tensors are memory-mapped on the CPU, class paths are today's.
 
+    Classes that it names are not imported: `check_specs` says which of them may be.
+
     Raises:
-        CheckpointError: the file is missing, unreadable, or was not written by this project.
+        CheckpointError: the file is missing, unreadable, damaged, or was not written by this project.
     """
     path = Path(path)
     if not path.is_file():
         raise CheckpointError(f"{path} is no file; give a checkpoint such as mlruns/checkpoints/RUN_ID/best.ckpt")
+    check_file(path)
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
     except Exception as error:  # torch raises many kinds of exception for a file that is no checkpoint
         raise CheckpointError(
             f"{path} cannot be read as a checkpoint; it is damaged or another kind of file"
         ) from error
-    if not isinstance(checkpoint, dict) or "lightning_pose" not in checkpoint:
+    if not isinstance(checkpoint, dict) or not {"lightning_pose", "state_dict"} <= checkpoint.keys():
         raise CheckpointError(f"{path} was not written by lightning_pose; give a checkpoint that `fit` wrote")
     return checkpoint | {"lightning_pose": resolve_class_paths(checkpoint["lightning_pose"])}
+
+
+def check_file(path: Path) -> None:
+    """Compare a checkpoint's content with its checksums: `torch.save` writes a zip archive, with a CRC-32 an entry.
+
+    Torch does not check them when it reads the file.
+
+    Raises:
+        CheckpointError: they differ, or the file is no such archive.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            damaged = archive.testzip()
+    except Exception as error:  # a damaged archive ends in many kinds of exception
+        raise CheckpointError(
+            f"{path} cannot be read as a checkpoint; it is damaged or another kind of file"
+        ) from error
+    if damaged is not None:
+        raise CheckpointError(
+            f"{path} is damaged (the checksum of {damaged} differs); copy it again, or train it again"
+        )

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import logging
-import re
 import warnings
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -18,7 +19,14 @@ from lightning.pytorch.callbacks import Timer
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
-from lightning_pose.checkpoint import read_checkpoint, resolve_class_path, resolve_class_paths
+from lightning_pose.checkpoint import (
+    check_specs,
+    find_class_paths,
+    read_checkpoint,
+    resolve_class_path,
+    resolve_class_paths,
+)
+from lightning_pose.commands.setting_errors import REMEDY, explain_setting_error
 from lightning_pose.data import SceneDataModule, require_clips
 from lightning_pose.errors import CheckpointError, ConfigError
 from lightning_pose.evaluation.callback import TestReport
@@ -67,27 +75,11 @@ class PoseParser(LightningArgumentParser):
         super().__init__(*args, **settings)
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
-        raise ConfigError(_one_line(message)) from ex
+        raise ConfigError(explain_setting_error(message)) from ex
 
 
 SCENES = ("root", "train_scenes")
 """Settings of the data modules that say what a run trains on."""
-
-REMEDY = "`python -m lightning_pose fit --help` explains every setting"
-NOISE = re.compile(
-    r"Does not validate against any of the Union subtypes|Subtypes: .*|Errors:|Expected a <class 'NoneType'>"
-    r"|Given value type: .*|Given value: (NestedArg|Namespace|\{).*"
-)
-
-
-def _one_line(message: str) -> str:
-    """jsonargparse's message in one line, without its notes on types: which setting, and what is wrong with it."""
-    lines = [NOISE.sub("", line).strip(" -") for line in message.splitlines()]
-    text = " ".join(line for line in lines if line)
-    text = re.sub(r"<class '([^']+)'>", r"\1", re.sub(r'Parser key "([^"]+)":', r"\1:", text))
-    # A nested parser's message comes through here twice.
-    return text if text.endswith(REMEDY) else f"{text}; {REMEDY}"
-
 
 HELP = {
     "fit": """Train a localizer, test its best checkpoint, and print it beside its baselines.
@@ -112,7 +104,8 @@ Settings of an architecture, a data module, a feature extractor:
 The checkpoint knows its architecture and its data; both can be overridden.
 
   test --ckpt_path mlruns/checkpoints/RUN_ID/best.ckpt
-  test --ckpt_path mlruns/checkpoints/RUN_ID/best.ckpt --data.root OTHER_COPY""",
+  test --ckpt_path mlruns/checkpoints/RUN_ID/best.ckpt --data.root OTHER_COPY
+  test --ckpt_path FILE --allow my_package.MyNet      a checkpoint that names a class of your own""",
     "predict": """Write a checkpoint's poses of the test frames, one TUM file a sequence.
 
   predict --ckpt_path mlruns/checkpoints/RUN_ID/best.ckpt""",
@@ -121,6 +114,9 @@ The checkpoint knows its architecture and its data; both can be overridden.
   extract --config configs/surf_lstm.yaml --data.root DIR""",
 }
 
+
+ALLOW_HELP = """Class path, or package, of your own architecture, extractor or backbone that the checkpoint may name.
+May be given several times. Classes of this package, and those that your config or command line names, are allowed."""
 
 PROGRAM = "python -m lightning_pose"
 
@@ -176,7 +172,7 @@ class PoseCLI(LightningCLI):
             parser_kwargs={verb: _parser_settings(verb) for verb in self.subcommands()}
             if run
             else _parser_settings("extract"),
-            args=_with_saved_config(args) if run else args,
+            args=_with_saved_config(args) if run else _require_config("extract", args),
             run=run,
         )
 
@@ -185,6 +181,8 @@ class PoseCLI(LightningCLI):
         parser.link_arguments("data.input_shape", "model.init_args.input_shape", apply_on="instantiate")
         parser.add_lightning_class_args(BestCheckpoint, "best")
         parser.add_lightning_class_args(TestReport, "report")
+        if not str(parser.prog).endswith(("fit", "extract")):
+            parser.add_argument("--allow", action="append", help=ALLOW_HELP)
 
     def parse_arguments(self, parser: LightningArgumentParser, args: list[str]) -> None:
         try:
@@ -204,7 +202,7 @@ class PoseCLI(LightningCLI):
         except ValueError as error:
             # jsonargparse wraps what a constructor refuses; the constructor's own words are among its lines.
             if str(error).startswith("Does not validate"):
-                raise ConfigError(_one_line(str(error))) from error
+                raise ConfigError(explain_setting_error(str(error))) from error
             raise
         self.model.check_data(self.datamodule)
 
@@ -284,21 +282,53 @@ def _with_saved_config(args: list[str]) -> list[str]:
     parser = _OptionParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--ckpt_path")
     parser.add_argument("--config", "-c", action="append", default=[])
+    parser.add_argument("--allow", action="append", default=[])
     options, rest = parser.parse_known_args(args[1:])
     asks = any(word == "-h" or "help" in word or word.startswith("--print_config") for word in rest)
-    if args[0] == "fit" or asks:
+    if asks:
         return args
+    if args[0] == "fit":
+        return _require_config("fit", args)
     if options.ckpt_path is None:
         raise ConfigError(f"{args[0]} needs a checkpoint; give it with --ckpt_path")
-    saved = read_checkpoint(options.ckpt_path)["lightning_pose"]
-    settings = {"model": {**saved["model"], "init_args": {**saved["model"]["init_args"]}}}
-    del settings["model"]["init_args"]["input_shape"]  # it follows from the data
-    if not options.config:
-        settings["data"] = saved["data"]
+    named = [*options.allow, *_list_named_classes(options.config, rest)]
+    saved = check_specs(read_checkpoint(options.ckpt_path)["lightning_pose"], named)
+    model, data = saved["model"], saved["data"]
+    assert model is not None
     for file in options.config:
-        _check_architecture(options.ckpt_path, saved["model"]["class_path"], _architecture_of(file))
+        _check_architecture(options.ckpt_path, model["class_path"], _architecture_of(file))
+    model["init_args"].pop("input_shape", None)  # it follows from the data
+    settings = {"model": model} | ({} if options.config or data is None else {"data": data})
     configs = [word for text in (*options.config, json.dumps(settings)) for word in ("--config", text)]
     return [args[0], *configs, *rest, "--ckpt_path", options.ckpt_path]
+
+
+def _require_config(verb: str, args: list[str]) -> list[str]:
+    """The command line, if it gives a config, an architecture and data, or asks for help.
+
+    Raises:
+        ConfigError: it does not, so that no other option can be understood.
+    """
+    names = {word.partition("=")[0] for word in args}
+    asks = any(word == "-h" or "help" in word or word.startswith("--print_config") for word in args)
+    if not asks and not names & {"--config", "-c"} and not {"--model", "--data"} <= names:
+        raise ConfigError(
+            f"{verb} needs a config, which says what to train and on which data; give one with --config, such as "
+            "configs/quickstart.yaml, or configs/surf_lstm.yaml with --data.root DIR"
+        )
+    return args
+
+
+def _list_named_classes(configs: list[str], words: list[str]) -> list[str]:
+    """The class paths in config files and in the words of a command line, which the user trusts by naming them."""
+    settings: list[object] = []
+    for word, following in pairwise([*words, ""]):
+        name, equals, value = word.partition("=")
+        settings.append({name.rpartition(".")[2].lstrip("-"): value if equals else following})
+    for file in configs:
+        with contextlib.suppress(OSError, UnicodeDecodeError, yaml.YAMLError):  # the parser says what is wrong with it
+            settings.append(yaml.safe_load(Path(file).read_text()))
+    return find_class_paths(settings)
 
 
 def _architecture_of(config: str) -> str | None:

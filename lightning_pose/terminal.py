@@ -37,7 +37,7 @@ class Sheet:
         Args:
             width: of the terminal in characters; by default it is found out.
         """
-        console = Console(width=width or (None if sys.stdout.isatty() else UNKNOWN_WIDTH))
+        console = Console(width=width or (None if sys.stdout.isatty() else UNKNOWN_WIDTH), emoji=False)
         columns = list(zip(self.heads, *self.rows, strict=True))
         usual = _find_least_width([[*head.split(), *cells] for head, *cells in columns])
         exchanged = _find_least_width([[word for head in self.heads for word in head.split()], *self.rows])

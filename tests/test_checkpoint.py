@@ -21,7 +21,7 @@ from tests.helpers import Thumbnails
 def test_a_description_is_plain_and_rebuilds() -> None:
     spec = describe_object(Thumbnails(rows=3, columns=4))
     assert spec == {"class_path": "tests.helpers.Thumbnails", "init_args": {"rows": 3, "columns": 4}}
-    rebuilt = build_object(spec)
+    rebuilt = build_object(spec, allow="tests")
     assert isinstance(rebuilt, Thumbnails)
     assert rebuilt.feature_shape == (3, 4)
 
@@ -41,7 +41,7 @@ def test_class_path_of_a_builtin() -> None:
 )
 def test_what_cannot_be_rebuilt_is_refused(path: str, init_args: dict[str, Any], message: str) -> None:
     with pytest.raises(CheckpointError, match=message):
-        build_object({"class_path": path, "init_args": init_args})
+        build_object({"class_path": path, "init_args": init_args}, allow=["nowhere", "tests", "Thing"])
 
 
 CHECKPOINTS = Path(__file__).parent / "checkpoints"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -90,3 +91,8 @@ def test_light_modules_stay_light() -> None:
     check = f"import sys\n{imports}\nsys.exit(', '.join(sorted({{'lightning', 'mlflow'}} & set(sys.modules))) or 0)"
     process = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True, check=False)
     assert process.returncode == 0, process.stderr
+
+
+def test_a_full_disk_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_verb(monkeypatch, OSError(errno.ENOSPC, "No space left on device", "room/frame.png")) == 2
+    assert capsys.readouterr().err.startswith("error: room/frame.png cannot be written (No space left on device); free")

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.console import Console
-from rich.markup import escape
 from rich.progress import track
 from rich.table import Table
 
@@ -39,7 +38,7 @@ def main(argv: list[str]) -> int:
         PoseError: the dataset cannot be read at all.
     """
     args = _build_check_parser().parse_args(argv)
-    console = Console()
+    console = Console(markup=False, emoji=False)  # names of scenes are not markup
     scene = load_scene(args.dir, args.format, on_bad_frame="list")
     reading = track(read_image_files(scene), "reading images", len(scene.frames), console=console, transient=True)
     files = list(reading)
@@ -76,7 +75,7 @@ def _describe_drop(scene: Scene) -> list[str]:
 
 
 def _make_overview(scene: Scene, files: list[ImageFile], compared: dict[str, str]) -> Table:
-    table = Table(title=f"{escape(scene.name)}: {len(scene.frames)} frames", show_header=False, title_justify="left")
+    table = Table(title=f"{scene.name}: {len(scene.frames)} frames", show_header=False, title_justify="left")
     for name, value in (describe_scene(scene, files) | compared).items():
         table.add_row(name, value)
     return table
@@ -88,7 +87,7 @@ def _make_sequence_table(scene: Scene) -> Table:
         table.add_column(name, justify="right")
     for sequence in count_sequence_frames(scene):
         numbers = (*sequence.counts.values(), sequence.first, sequence.last)
-        table.add_row(escape(sequence.name), *map(str, numbers))
+        table.add_row(sequence.name, *map(str, numbers))
     return table
 
 

@@ -29,7 +29,7 @@ def print_results(results: Mapping[str, Mapping[str, float]], title: str, extras
     for i, (system, metrics) in enumerate(results.items()):
         cells = [metric.format(metrics[name]) for name, metric in columns.items()]
         table.add_row(system, *cells, style="bold" if i == 0 else None, end_section=i == 0)
-    Console(width=None if sys.stdout.isatty() else 120).print(table)
+    Console(width=None if sys.stdout.isatty() else 120, markup=False, emoji=False).print(table)
 
 
 def results_markdown(results: Mapping[str, Mapping[str, float]], extras: Mapping[str, float]) -> str:

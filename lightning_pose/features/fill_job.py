@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import torch
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
 from lightning_pose.errors import ImageError
@@ -114,11 +114,15 @@ class FillJob:
         """The file of a key's record."""
         return self.folder / key[:2] / f"{key}.safetensors"
 
+    def _record_owner(self, key: str) -> str:
+        """Whose record a key's file holds: extractor and settings, and the image."""
+        return f"{self.folder.name}/{key}"
+
     def _visit_record(self, key: str) -> bool:
         """Read and visit the record of a key; return False if the cache has none or a damaged one."""
         file = self._record_file(key)
         try:
-            record = read_record(file)
+            record = read_record(file, self._record_owner(key))
         except DamagedError as error:
             log.warning("%s is damaged (%s); its image is extracted again", file, error)
             self.damaged.add(key)
@@ -141,7 +145,7 @@ class FillJob:
                 self.bad[number] = error
         records = self.extractor.extract(list(images.values())) if images else []
         for key, record in zip(images, records, strict=True):
-            write_record(self._record_file(key), record)
+            write_record(self._record_file(key), record, self._record_owner(key))
             self.visit(self.numbers[key], record)
         return set(images)
 
@@ -176,7 +180,7 @@ class _RateColumn(ProgressColumn):
 def _make_extraction_bar(shown: bool) -> Progress:
     """A progress bar on stderr, with images per second."""
     return Progress(
-        "{task.description}",
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         _RateColumn(),

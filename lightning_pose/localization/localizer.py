@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
-from lightning_pose.checkpoint import build_object, read_checkpoint
+from lightning_pose.checkpoint import build_object, check_specs, read_checkpoint
 from lightning_pose.errors import CheckpointError
 from lightning_pose.features.base import FeatureExtractor
 from lightning_pose.geometry.relative import RelativeFrame
@@ -38,27 +38,39 @@ class Localizer:
         self.clips = clips
 
     @classmethod
-    def from_checkpoint(cls, path: str | Path) -> Localizer:
+    def from_checkpoint(cls, path: str | Path, allow: str | Iterable[str] = ()) -> Localizer:
         """Restore a localizer from a checkpoint that `fit` wrote.
 
+        Args:
+            path: the file; it may come from anyone, because only classes of this package are imported.
+            allow: class paths, or packages, of your own architectures, extractors and backbones that it may name.
+
         Raises:
-            CheckpointError: the file cannot be read, or holds no data settings.
+            CheckpointError: the file cannot be read, holds no data settings, or names a class that is not allowed.
         """
+        allow = [allow] if isinstance(allow, str) else list(allow)
         checkpoint = read_checkpoint(path)
-        specs = checkpoint["lightning_pose"]
+        specs = check_specs(checkpoint["lightning_pose"], allow)
         if specs["data"] is None:
             raise CheckpointError(f"{path} does not say which features it reads; train with a data module")
-        model: PoseModule = build_object(specs["model"])
-        model.load_state_dict(checkpoint["state_dict"])
+        model: PoseModule = build_object(specs["model"] or {}, allow, "lightning_pose.models")
+        try:
+            model.load_state_dict(checkpoint["state_dict"])
+        except (RuntimeError, AttributeError) as error:
+            reason = " ".join(str(error).split())[:200]
+            raise CheckpointError(f"the weights in {path} are not those of its settings ({reason})") from error
         data = specs["data"]["init_args"]
         clips = (data["clip_length"], data["relative_frame"]) if model.reads_clips else None
-        return cls(build_object(data["extractor"]), model, clips)
+        return cls(build_object(data["extractor"], allow, "lightning_pose.features"), model, clips)
 
-    def __call__(self, images: Sequence[str | Path | np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    def __call__(
+        self, images: str | Path | np.ndarray | Sequence[str | Path | np.ndarray]
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Locate images.
 
         Args:
-            images: M files, or uint8 arrays as `extractor.color` asks for: (H, W) gray or (H, W, 3) RGB.
+            images: M files, or uint8 arrays as `extractor.color` asks for: (H, W) gray or (H, W, 3) RGB. One image
+                may stand alone, and is a list of one.
 
         Returns:
             position_m (M, 3) and quat_wxyz (M, 4), camera-to-world. For a model of clips the images are one video, in
@@ -67,10 +79,14 @@ class Localizer:
         Raises:
             ImageError: an image cannot be read.
         """
-        read = self.extractor.read
-        arrays = [image if isinstance(image, np.ndarray) else read(image) for image in images]
-        records = self.extractor.extract(arrays)
-        features = torch.from_numpy(np.stack([self.extractor.features(record) for record in records]))
+        extractor, axes = self.extractor, 2 if self.extractor.color == "gray" else 3
+        if isinstance(images, str | Path) or (isinstance(images, np.ndarray) and images.ndim == axes):
+            images = [images]
+        arrays = [image if isinstance(image, np.ndarray) else extractor.read(image) for image in images]
+        if not arrays:
+            return np.zeros((0, 3), np.float32), np.zeros((0, 4), np.float32)
+        records = extractor.extract(arrays)
+        features = torch.from_numpy(np.stack([extractor.features(record) for record in records]))
         if self.clips is not None:
             chained = locate_sequence(self.model, features, *self.clips)
             return chained[0].numpy(), chained[1].numpy()

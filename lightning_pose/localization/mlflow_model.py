@@ -23,7 +23,9 @@ class LocalizerModel(PythonModel):
     """The model that `mlflow.pyfunc.load_model` loads from a run's `model`."""
 
     def load_context(self, context: PythonModelContext) -> None:
-        self.localizer = Localizer.from_checkpoint(context.artifacts["checkpoint"])
+        # `fit` says here which classes of the user's own it trained; the checkpoint itself is not believed.
+        allow = (context.model_config or {}).get("allow", ())
+        self.localizer = Localizer.from_checkpoint(context.artifacts["checkpoint"], allow)
 
     def predict(
         self, context: PythonModelContext | None, model_input: list[str], params: dict[str, Any] | None = None

@@ -44,7 +44,7 @@ def print_table(report: Report, file: TextIO | None = None) -> None:
         ends = i + 1 < len(lines) and report.rows[i + 1].kind != row.kind
         cells = [escape(cell).replace(BOLD, "[bold]").replace(END, "[/bold]") for cell in line]
         table.add_row(*cells, style=None if row.kind == "own" else "dim", end_section=ends)
-    console = Console(file=stream, width=None if stream.isatty() else 1000, highlight=False)
+    console = Console(file=stream, width=None if stream.isatty() else 1000, highlight=False, emoji=False)
     console.print(table)
     for note in _list_notes(report):
         console.print(note, markup=False, soft_wrap=True)

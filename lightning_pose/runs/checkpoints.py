@@ -9,6 +9,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from torch import Tensor
 
 from lightning_pose.data.datamodule import find_datamodule
+from lightning_pose.runs.checkpoint_files import use_checkpoint_files
 from lightning_pose.runs.logger import MLflowLogger
 
 __all__ = ["BestCheckpoint", "LastCheckpoint", "checkpoint_folder", "run_logger"]
@@ -30,6 +31,7 @@ class _RunCheckpoint(ModelCheckpoint):
     """A checkpoint in the run's own folder, whose path is known only once the run has begun."""
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        use_checkpoint_files(trainer)
         if stage == "fit":
             self.dirpath = str(checkpoint_folder(trainer))
         super().setup(trainer, pl_module, stage)

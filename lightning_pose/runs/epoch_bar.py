@@ -45,7 +45,7 @@ class EpochBar(ProgressBar):
         if self._on and console.is_terminal:
             columns = (
                 TextColumn("epoch"), MofNCompleteColumn(), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn(),
-                TextColumn("{task.description}"),
+                TextColumn("{task.description}", markup=False),
             )  # fmt: skip
             self._bar = Progress(*columns, console=console)
             self._task = self._bar.add_task("", total=trainer.max_epochs, completed=trainer.current_epoch)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import ast
 import logging
 import os
 import signal
 import threading
 import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,9 +18,13 @@ from typing import TYPE_CHECKING
 from lightning.fabric.utilities.rank_zero import rank_zero_only
 from lightning.pytorch.loggers import MLFlowLogger
 
-from lightning_pose.errors import CheckpointError
+from lightning_pose.checkpoint import find_class_paths, read_checkpoint
+from lightning_pose.errors import CheckpointError, ConfigError
 from lightning_pose.paths import STORE_VARIABLE, default_tracking_uri
+from lightning_pose.runs.client import BufferedClient, is_unreachable
 from lightning_pose.runs.process import has_owner_died, process_tags
+from lightning_pose.runs.reader import mask_passwords, read_pages
+from lightning_pose.runs.store import prepare_store, sqlite_file
 from lightning_pose.runs.tags import PARENT_TAG
 
 if TYPE_CHECKING:
@@ -41,6 +47,9 @@ REQUIREMENTS = (
 """Distributions that a logged model needs; this package itself is logged with it."""
 
 PACKAGE = Path(__file__).parents[1]
+
+PARAMETER_LENGTH = 250
+"""Characters of a parameter that Lightning's logger keeps."""
 
 
 class MLflowLogger(MLFlowLogger):
@@ -71,13 +80,13 @@ class MLflowLogger(MLFlowLogger):
         root: str = "mlruns",
     ) -> None:
         # alembic and mlflow announce each table of a new database on the terminal.
-        for noisy in ("alembic", "mlflow.store.db.utils", "mlflow.tracking.fluent"):
+        for noisy in ("alembic", "mlflow.tracking.fluent"):
             logging.getLogger(noisy).setLevel(logging.WARNING)
+        # It announces tables too, and prints the traceback of an error that it raises.
+        logging.getLogger("mlflow.store.db.utils").setLevel(logging.CRITICAL)
         logging.getLogger("lightning.pytorch.loggers.mlflow").setLevel(logging.ERROR)  # of a new experiment
-        uri = tracking_uri or default_tracking_uri(root)
+        uri = prepare_store(tracking_uri or default_tracking_uri(root))
         local = uri.startswith("sqlite:///")
-        if local:
-            Path(uri.removeprefix("sqlite:///")).parent.mkdir(parents=True, exist_ok=True)
         super().__init__(
             experiment_name=experiment_name,
             run_name=run_name,
@@ -85,6 +94,7 @@ class MLflowLogger(MLFlowLogger):
             run_id=run_id,
             artifact_location=(Path(root) / "artifacts").resolve().as_uri() if local else None,
         )
+        self._writer = BufferedClient(uri)
         self.uri = uri
         self.run_name = run_name
         self.stopped_as = "FAILED"
@@ -93,16 +103,38 @@ class MLflowLogger(MLFlowLogger):
 
     @property
     def experiment(self) -> MlflowClient:
-        """The MLflow client of the store, with the run created; Lightning's code uses it by this name."""
-        with _keep_environment():
-            client = super().experiment
-        self._opened = True
-        return client
+        """The MLflow client of the store, with the run created; Lightning's code uses it by this name.
+
+        Raises:
+            ConfigError: the store is gone before there is a run.
+        """
+        if not self._opened:
+            with _keep_environment():
+                self._open_run()
+            self._opened = True
+        return self._writer
+
+    def _open_run(self) -> None:
+        """Find or create the experiment and the run."""
+        from mlflow.exceptions import MlflowException
+
+        try:
+            try:
+                _ = super().experiment
+            except MlflowException as error:
+                if error.error_code != "RESOURCE_ALREADY_EXISTS":
+                    raise
+                _ = super().experiment  # another process has created the experiment at the same time
+        except MlflowException as error:
+            if not is_unreachable(error):
+                raise
+            reason = mask_passwords(str(error).strip().partition("\n")[0])[:200]
+            raise ConfigError(f"the MLflow store {mask_passwords(self.uri)} takes no run ({reason})") from error
 
     @property
-    def client(self) -> MlflowClient:
+    def client(self) -> BufferedClient:
         """The MLflow client of the store, with the run created and this process recorded as its owner."""
-        client = self.experiment
+        _, client = self.experiment, self._writer
         if not self._claimed:
             self._claimed = True
             # A resumed run belongs to this process now; with the tags of the ended one it would be closed.
@@ -133,6 +165,9 @@ class MLflowLogger(MLFlowLogger):
     @rank_zero_only
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
         """Log metrics; Ctrl-C takes effect once they are written."""
+        if sqlite_file(self.uri) is None:
+            super().log_metrics(metrics, step)
+            return
         with _delay_interrupts():
             super().log_metrics(metrics, step)
 
@@ -141,6 +176,7 @@ class MLflowLogger(MLFlowLogger):
         """End the run as FINISHED, or as `stopped_as` if Lightning reports that it failed."""
         if self._opened:
             self.client.set_terminated(str(self.run_id), self.stopped_as if status == "failed" else "FINISHED")
+            self.client.finish()
 
 
 @contextmanager
@@ -207,16 +243,17 @@ def find_last_run(
     """
     from mlflow import MlflowClient
 
-    client = MlflowClient(uri)
+    client = MlflowClient(prepare_store(uri))
     experiment = client.get_experiment_by_name(experiment_name)
-    named = (f'params.`data.{name}` = "{value}"' for name, value in data.items() if value is not None)
-    query = " and ".join([f"tags.architecture = '{architecture}'", *named])
-    runs = client.search_runs([experiment.experiment_id], query) if experiment else []  # newest first
+    ids = [experiment.experiment_id] if experiment else []
+    query = f"tags.architecture = '{architecture}'"
+    # Newest first. The scenes are compared here, because MLflow's query has no way to write a quotation mark.
+    runs = read_pages(lambda token: client.search_runs(ids, query, page_token=token)) if ids else ()
     for run in runs:
-        # Older runs lack settings that are new since; None is their default.
-        alike = all(run.data.params.get(f"data.{name}", "None") == str(value) for name, value in data.items())
         checkpoint = checkpoints / run.info.run_id / "last.ckpt"
-        if alike and checkpoint.is_file():
+        # Older runs lack settings that are new since; None is their default.
+        scenes = {name: run.data.params.get(f"data.{name}", "None") for name in data}
+        if checkpoint.is_file() and all(_is_same_scene(scenes[name], value) for name, value in data.items()):
             return run.info.run_id, checkpoint
     scene = " ".join(f"data.{name}={value}" for name, value in data.items())
     raise CheckpointError(
@@ -224,14 +261,42 @@ def find_last_run(
     )
 
 
+def _is_same_scene(logged: str | None, value: object) -> bool:
+    """Whether a parameter of a run names the same folders as a setting does, however each of them is written."""
+    if logged is None or logged == str(value)[:PARAMETER_LENGTH]:
+        return logged is not None
+    with suppress(ValueError, SyntaxError):
+        return _list_folders(ast.literal_eval(logged) if isinstance(value, list) else logged) == _list_folders(value)
+    return False
+
+
+def _list_folders(value: object) -> list[Path]:
+    """Absolute paths of one folder or of several, without symbolic links."""
+    names = value if isinstance(value, list) else [value]
+    return [Path(str(name)).expanduser().resolve() for name in names]
+
+
 def log_localizer(logger: MLflowLogger, checkpoint: Path) -> None:
-    """Log a localizer to the run as `model`, for `mlflow.pyfunc.load_model`."""
-    import mlflow
+    """Log a localizer to the run as `model`, for `mlflow.pyfunc.load_model`.
+
+    Args:
+        logger: of the run.
+        checkpoint: that the run has written; the model may import the classes of the user's own that it names.
+    """
+    named = find_class_paths(read_checkpoint(checkpoint)["lightning_pose"])
+    allow = [path for path in named if "." in path and not path.startswith(f"{PACKAGE.name}.")]
 
     os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
     # Messages on pip, which uv lacks, on type hints of tables, and on a lock file that MLflow copies.
     for noisy in ("mlflow.utils.environment", "mlflow.models.signature", "mlflow.utils.uv_utils"):
         logging.getLogger(noisy).setLevel(logging.ERROR)
+    logger.client.attempt(partial(_log_model, logger, checkpoint, allow))
+
+
+def _log_model(logger: MLflowLogger, checkpoint: Path, allow: list[str]) -> None:
+    """Log the model, as MLflow does it for a run that is active in this process."""
+    import mlflow
+
     with _keep_environment(), warnings.catch_warnings():
         # The model takes files, for which MLflow has no schema, and it warns of that.
         warnings.simplefilter("ignore", UserWarning)
@@ -241,6 +306,7 @@ def log_localizer(logger: MLflowLogger, checkpoint: Path) -> None:
                 name="model",
                 python_model=str(PACKAGE / "localization" / "mlflow_model.py"),
                 artifacts={"checkpoint": str(checkpoint)},
+                model_config={"allow": allow},
                 code_paths=[str(PACKAGE)],
                 pip_requirements=[f"{name}=={version(name)}" for name in REQUIREMENTS],
             )

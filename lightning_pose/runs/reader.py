@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from mlflow import MlflowClient
     from mlflow.store.entities import PagedList
 
-__all__ = ["Run", "mask_passwords", "read_client_runs", "read_runs"]
+__all__ = ["Run", "mask_passwords", "read_client_runs", "read_pages", "read_runs"]
 
 Item = TypeVar("Item")
 Query = Callable[[str], Iterable[Any]]
@@ -227,9 +227,9 @@ def _read_server(uri: str) -> list[Run]:
 
 def read_client_runs(client: MlflowClient, page: int = 1000) -> list[Run]:
     """As `read_runs`, page by page, unsorted."""
-    names = {e.experiment_id: e.name for e in _read_pages(lambda token: client.search_experiments(page_token=token))}
+    names = {e.experiment_id: e.name for e in read_pages(lambda token: client.search_experiments(page_token=token))}
     query = "attributes.status = 'FINISHED'"
-    found = _read_pages(lambda token: client.search_runs(list(names), query, max_results=page, page_token=token))
+    found = read_pages(lambda token: client.search_runs(list(names), query, max_results=page, page_token=token))
     return [
         Run(
             run.info.run_id,
@@ -245,7 +245,7 @@ def read_client_runs(client: MlflowClient, page: int = 1000) -> list[Run]:
     ]
 
 
-def _read_pages(ask: Callable[[str | None], PagedList[Item]]) -> Iterator[Item]:
+def read_pages(ask: Callable[[str | None], PagedList[Item]]) -> Iterator[Item]:
     """All items of an answer that comes in pages, which are asked for by their token."""
     token = None
     while token != "":

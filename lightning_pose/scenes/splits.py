@@ -97,7 +97,10 @@ def hold_out(
         return indices, indices[:0]
     wanted = max(1, round(fraction * len(indices)))
     if wanted >= len(indices):
-        raise ConfigError(f"{setting} {fraction} leaves none of {len(indices)} frames to train on; lower it")
+        raise ConfigError(
+            f"{setting} {fraction} leaves none of {len(indices)} frames to train on; "
+            "lower it, or give a scene with more frames"
+        )
     held = _choose_halves(indices, sequences[indices], wanted, block)
     if held is None:
         held = _choose_sequences(indices, sequences[indices], wanted, block)

@@ -123,3 +123,11 @@ def test_format_is_forced(root: Path) -> None:
 def test_it_starts_without_torch() -> None:
     code = "import sys, lightning_pose.commands.check; sys.exit(bool({'torch', 'lightning'} & sys.modules.keys()))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_a_name_that_looks_like_markup_is_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    root = tmp_path / "room [a] [bold]b :smile:"
+    root.mkdir()
+    write_seven_scenes(root, train={1: 10, 2: 10}, test={3: 10})
+    main([str(root)])
+    assert "room [a] [bold]b :smile:: 30 frames" in capsys.readouterr().out

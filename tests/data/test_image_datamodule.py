@@ -131,7 +131,10 @@ def test_a_description_rebuilds_it(scene: Path, tmp_path: Path) -> None:
 
 
 def _built_extractor(spec: dict[str, Any]) -> dict[str, Any]:
-    return {**spec, "init_args": {**spec["init_args"], "extractor": build_object(spec["init_args"]["extractor"])}}
+    return {
+        **spec,
+        "init_args": {**spec["init_args"], "extractor": build_object(spec["init_args"]["extractor"], allow="tests")},
+    }
 
 
 def test_a_missing_image_is_named(scene: Path, tmp_path: Path) -> None:

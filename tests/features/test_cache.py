@@ -295,3 +295,14 @@ def test_progress_goes_to_stderr(tmp_path: Path, capsys: pytest.CaptureFixture[s
     out, err = capsys.readouterr()
     assert out == ""
     assert "colormeans" in err
+
+
+def test_a_record_put_in_another_image_s_place_is_extracted_again(tmp_path: Path) -> None:
+    paths = write_images(tmp_path / "images", 2)
+    cache = FeatureCache(ColorMeans(), tmp_path / "cache")
+    cache.fill(paths, progress=False)
+    first, second = records_in(tmp_path / "cache")
+    second.write_bytes(first.read_bytes())
+    assert cache.fill(paths, progress=False).redone == 1
+    np.testing.assert_array_equal(cache.features(paths, progress=False), expected(2))
+    assert cache.fill(paths, progress=False).redone == 0

@@ -269,7 +269,7 @@ def test_extractors_can_be_described_copied_and_pickled() -> None:
     extractor = CNN(f"{HERE}.Pixels", output="map", size=32, crop="whole")
     expected = features(extractor, bands())
     for other in (
-        build_object(describe_object(extractor)),
+        build_object(describe_object(extractor), allow="tests"),
         copy.deepcopy(extractor),
         pickle.loads(pickle.dumps(extractor)),
     ):

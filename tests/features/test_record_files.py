@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 from contextlib import suppress
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import pytest
 from lightning_pose.errors import CacheError
 from lightning_pose.features.base import Record
 from lightning_pose.features.record_files import DamagedError, read_record, write_file_atomically, write_record
+from tests.helpers import limit_file_size
 
 RECORD = {
     "descriptors": np.arange(6, dtype=np.float32).reshape(2, 3).T,  # not contiguous, as a slice may be
@@ -61,15 +61,26 @@ def test_every_truncation_is_noticed(tmp_path: Path) -> None:
             read_record(file)
 
 
-def test_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(self: Path, data: bytes) -> int:
-        self.touch()
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(Path, "write_bytes", full)
-    with pytest.raises(CacheError, match=r"No space left on device.*free some space, or set LIGHTNING_POSE"):
+def test_full_disk(tmp_path: Path) -> None:
+    with limit_file_size(3), pytest.raises(CacheError, match=r"File too large.*free some space, or set LIGHTNING_POSE"):
         write_file_atomically(tmp_path / "x", b"data")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("owner", ["surf-1/bb", "orb-1/aa"])
+def test_a_record_of_another_image_is_noticed(owner: str, tmp_path: Path) -> None:
+    """As when a file of the cache is copied over another one, of that extractor or of another."""
+    file = tmp_path / "x.safetensors"
+    write_record(file, RECORD, "surf-1/aa")
+    assert same(read_record(file, "surf-1/aa"), RECORD)
+    with pytest.raises(DamagedError, match="it is the record of surf-1/aa"):
+        read_record(file, owner)
+
+
+def test_a_record_of_an_earlier_version_is_believed(tmp_path: Path) -> None:
+    file = tmp_path / "x.safetensors"
+    write_record(file, RECORD)
+    assert same(read_record(file, "surf-1/aa"), RECORD)
 
 
 def test_unreadable_file(tmp_path: Path) -> None:

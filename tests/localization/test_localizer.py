@@ -17,7 +17,7 @@ from tests.helpers import Thumbnails, Trained
 
 @pytest.fixture
 def localizer(trained: Trained) -> Localizer:
-    return Localizer.from_checkpoint(trained.best)
+    return Localizer.from_checkpoint(trained.best, allow="tests")
 
 
 @pytest.fixture
@@ -72,3 +72,16 @@ def test_a_checkpoint_without_data(trained: Trained, tmp_path: Path) -> None:
     torch.save(checkpoint, tmp_path / "model.ckpt")
     with pytest.raises(CheckpointError, match=r"model.ckpt does not say which features it reads; train with"):
         Localizer.from_checkpoint(tmp_path / "model.ckpt")
+
+
+def test_one_image_may_stand_alone(localizer: Localizer, images: list[Path]) -> None:
+    expected = localizer(images[:1])
+    for image in (images[0], str(images[0]), read_gray(images[0])):
+        for found, right in zip(localizer(image), expected, strict=True):
+            np.testing.assert_array_equal(found, right)
+    with pytest.raises(ImageError, match=r"^a\.png does not exist"):
+        localizer("a.png")
+
+
+def test_no_image_has_no_pose(localizer: Localizer) -> None:
+    assert [part.shape for part in localizer([])] == [(0, 3), (0, 4)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import mlflow
@@ -11,7 +12,7 @@ import pytest
 from mlflow.pyfunc import PyFuncModel  # type: ignore[attr-defined]
 
 from lightning_pose.localization.localizer import Localizer
-from tests.helpers import Trained
+from tests.helpers import REPOSITORY, Trained
 
 COLUMNS = ["x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"]
 
@@ -27,9 +28,26 @@ def test_a_row_for_each_image(as_table: bool, model: PyFuncModel, trained: Train
     images = [str(image) for image in sorted((scene / "seq-03").glob("*.png"))]
     poses = model.predict(pd.DataFrame({"image": images}) if as_table else images)
     assert list(poses.columns) == COLUMNS
-    position_m, quat_wxyz = Localizer.from_checkpoint(trained.best)(images)
+    position_m, quat_wxyz = Localizer.from_checkpoint(trained.best, allow="tests")(images)
     np.testing.assert_allclose(poses.to_numpy(), np.hstack([position_m, quat_wxyz]))
 
 
 def test_it_carries_this_package(model: PyFuncModel) -> None:
     assert model.metadata.flavors["python_function"]["code"] == "code"
+
+
+def test_the_docs_load_it_in_a_copied_project(
+    trained: Trained, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The lines of docs/usage.md, in a folder for which MLflow has other places of artifacts."""
+    run, image = trained.run.info.run_id, str(next((scene / "seq-03").glob("*.png")))
+    shutil.copytree(trained.workplace.folder, tmp_path / "copy")
+    monkeypatch.chdir(tmp_path / "copy")
+    page = (REPOSITORY / "docs" / "usage.md").read_text()
+    code = page.split("```python\n")[1].split("```")[0].replace("RUN_ID", run).replace("image.jpg", image)
+    names: dict[str, pd.DataFrame] = {}
+    exec(code, names)
+    expected = np.hstack(Localizer.from_checkpoint(trained.best, allow="tests")([image]))
+    np.testing.assert_allclose(names["poses"].to_numpy(), expected)
+    place = mlflow.get_run(run).info.artifact_uri
+    assert str(place).startswith((tmp_path / "copy" / "mlruns" / "artifacts").as_uri())

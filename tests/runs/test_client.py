@@ -1,0 +1,128 @@
+"""BufferedClient: training goes on while the store is gone, and what was to be logged is sent later."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mlflow import MlflowClient
+from mlflow.entities import Metric, Param
+from mlflow.exceptions import MlflowException
+
+from lightning_pose.runs import client as client_module
+from lightning_pose.runs.client import BufferedClient
+from lightning_pose.runs.logger import MLflowLogger
+from tests.helpers import Workplace
+
+
+class Outage:
+    """Whether the store is gone; counts what is asked of it meanwhile."""
+
+    def __init__(self) -> None:
+        self.on = False
+        self.asked = 0
+
+    def wrap(self, method: Callable[..., Any]) -> Callable[..., Any]:
+        def ask(*args: Any, **kwargs: Any) -> Any:
+            if self.on:
+                self.asked += 1
+                raise MlflowException("API request failed with exception: connection refused")
+            return method(*args, **kwargs)
+
+        return ask
+
+
+@pytest.fixture
+def outage(monkeypatch: pytest.MonkeyPatch) -> Iterator[Outage]:
+    outage = Outage()
+    for name in ("log_batch", "log_text", "log_artifact", "log_figure", "set_tag", "set_terminated", "update_run"):
+        monkeypatch.setattr(MlflowClient, name, outage.wrap(getattr(MlflowClient, name)))
+    monkeypatch.setattr(MlflowClient, "get_run", outage.wrap(MlflowClient.get_run))
+    return outage
+
+
+@pytest.fixture
+def logger(workplace: Workplace, outage: Outage, monkeypatch: pytest.MonkeyPatch) -> MLflowLogger:
+    monkeypatch.chdir(workplace.folder)
+    monkeypatch.setattr(client_module, "WAIT_SECONDS", 0.0)
+    monkeypatch.setattr(client_module, "SHARE", 0.0)
+    return MLflowLogger(tracking_uri=workplace.uri)
+
+
+def test_what_the_store_did_not_take_is_sent_in_order(
+    logger: MLflowLogger, outage: Outage, caplog: pytest.LogCaptureFixture
+) -> None:
+    run, client = str(logger.run_id), logger.client
+    client.get_run(run)
+    with caplog.at_level(logging.WARNING, "lightning_pose"):
+        outage.on = True
+        for epoch in range(3):
+            logger.log_metrics({"val/loss": float(epoch)}, step=epoch)
+        logger.log_hyperparams({"seed": 3})
+        client.set_tag(run, "unit", "m")
+        client.log_text(run, "text", "note.txt")
+        kept = client.get_run(run).data
+        assert (kept.params, kept.tags["unit"]) == ({"seed": "3"}, "m")
+        outage.on = False
+        logger.log_metrics({"val/loss": 3.0}, step=3)
+    assert [metric.value for metric in client.get_metric_history(run, "val/loss")] == [0.0, 1.0, 2.0, 3.0]
+    found = client.get_run(run).data
+    assert (found.params, found.tags["unit"]) == ({"seed": "3"}, "m")
+    assert Path(client.download_artifacts(run, "note.txt")).read_text() == "text"
+    gone, back = [record.getMessage() for record in caplog.records]
+    assert "does not take what the run logs (API request failed" in gone
+    assert "answers again; 6 entries that were kept are sent" in back
+
+
+def test_a_gap_is_said(logger: MLflowLogger, outage: Outage, caplog: pytest.LogCaptureFixture) -> None:
+    client = logger.client
+    outage.on = True
+    logger.log_metrics({"val/loss": 1.0})
+    client.finish(seconds=0)
+    assert "1 entries (metrics, parameters, files) since" in caplog.text
+
+
+def test_a_store_that_is_gone_is_not_asked_all_the_time(
+    logger: MLflowLogger, outage: Outage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(client_module, "WAIT_SECONDS", 60.0)
+    assert logger.client
+    outage.on = True
+    for epoch in range(100):
+        logger.log_metrics({"val/loss": 1.0}, step=epoch)
+    assert outage.asked == 1
+
+
+def test_what_is_wrong_with_a_write_is_raised(logger: MLflowLogger) -> None:
+    client = BufferedClient(logger.uri)
+    run = str(logger.run_id)
+    client.log_batch(run, params=[Param("seed", "1")])
+    with pytest.raises(MlflowException, match="Changing param values is not allowed"):
+        client.log_batch(run, params=[Param("seed", "2")])
+    with pytest.raises(MlflowException, match="not found"):
+        client.log_batch("0" * 32, metrics=[Metric("a", 1.0, 0, 0)])
+
+
+def test_training_goes_on_without_its_store(
+    workplace: Workplace, outage: Outage, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It is gone from the first epoch on; the run is complete once it is back, in the test."""
+    monkeypatch.setattr(client_module, "WAIT_SECONDS", 0.0)
+    monkeypatch.setattr(client_module, "SHARE", 0.0)
+    monkeypatch.setattr(BufferedClient, "finish", lambda self: None)
+    log_metrics = MLflowLogger.log_metrics
+
+    def lose(self: MLflowLogger, metrics: Mapping[str, float], step: int | None = None) -> None:
+        outage.on = "baseline/oracle/position_mean_m" not in metrics  # which the test logs towards its end
+        log_metrics(self, metrics, step)
+
+    monkeypatch.setattr(MLflowLogger, "log_metrics", lose)
+    assert workplace.run("fit") == 0
+    assert "oracle" in capsys.readouterr().out
+    (run,) = workplace.runs()
+    assert run.info.run_name == "SurfLSTM wall N=6"
+    assert run.info.status == "FINISHED"
+    assert {"train/loss", "val/loss", "test/position_median_m"} <= run.data.metrics.keys()
