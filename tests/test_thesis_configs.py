@@ -12,7 +12,6 @@ import yaml
 
 from lightning_pose import models
 from lightning_pose.losses import LossConfig
-from lightning_pose.models.closed_form import ClosedFormModule
 from lightning_pose.sweeps.base_config import ParsedConfig, list_settings
 from tests.helpers import REPOSITORY
 
@@ -85,12 +84,7 @@ def test_the_other_config_says_at_its_head_in_what_it_departs(name: str) -> None
     ours = REPOSITORY / "configs" / f"{name}.yaml"
     head = ours.read_text().partition("seed_everything")[0]
     thesis, departing = list_values(REPOSITORY / "configs" / "thesis" / f"{name}.yaml"), list_values(ours)
-    ignored = (
-        {"learning_rate", "weight_decay", "schedule"} if issubclass(read_model(ours)[0], ClosedFormModule) else set()
-    )
-    different = {
-        key.rpartition(".")[2] for key in thesis | departing if thesis.get(key) != departing.get(key)
-    } - ignored
+    different = {key.rpartition(".")[2] for key in thesis | departing if thesis.get(key) != departing.get(key)}
     named = {word.strip("# ,:") for line in head.splitlines() if line.startswith("#   ") for word in line.split(" ")}
     assert different <= named
     assert f"configs/thesis/{name}.yaml" in head
