@@ -88,3 +88,20 @@ def test_the_other_config_says_at_its_head_in_what_it_departs(name: str) -> None
     named = {word.strip("# ,:") for line in head.splitlines() if line.startswith("#   ") for word in line.split(" ")}
     assert different <= named
     assert f"configs/thesis/{name}.yaml" in head
+
+
+STUDIES = sorted((REPOSITORY / "sweeps" / "thesis").glob("*.yaml"))
+
+
+@pytest.mark.parametrize("study", STUDIES, ids=lambda path: path.stem)
+def test_a_study_starts_from_the_form_of_the_thesis(study: Path) -> None:
+    content = yaml.safe_load(study.read_text())
+    bases = [content["base"]] if isinstance(content["base"], str) else content["base"]
+    others = {base for base in bases if not (study.parent / base).resolve().is_relative_to(THESIS[0].parent)}
+    assert others <= {"../../configs/posenet.yaml"}, "the only peer that is not the thesis's"
+    assert not any(key.startswith("model.") for key in content.get("settings", {})), "the network is the thesis's"
+
+
+def test_node_pose_is_searched_up_to_the_neighbours_of_the_thesis() -> None:
+    space = yaml.safe_load((REPOSITORY / "sweeps" / "node_pose.yaml").read_text())["space"]
+    assert space["model.neighbours"]["high"] == 40
