@@ -16,12 +16,12 @@ from lightning_pose.models import PoseModule
 from lightning_pose.scenes.synthetic import render_room
 from tests.helpers import REPOSITORY, Workplace
 
-CONFIGS = sorted((REPOSITORY / "configs").glob("*.yaml"))
+CONFIGS = sorted((REPOSITORY / "configs").rglob("*.yaml"))
 FIGURES = {
     "ImageDataModule": {"trajectory.png", "cumulative_errors.png", "error_vs_distance.png"},
     "ClipDataModule": {"trajectory.png", "error_by_length.png"},
 }
-every_config = pytest.mark.parametrize("config", CONFIGS, ids=lambda path: path.stem)
+every_config = pytest.mark.parametrize("config", CONFIGS, ids=lambda path: f"{path.parent.name}-{path.stem}")
 
 
 @pytest.fixture(scope="module")
@@ -54,6 +54,8 @@ def test_it_trains_tests_and_keeps_its_results(
         small += ["--data.clip_length", "4"]
     if issubclass(_class_of(extractor["class_path"]), LocalExtractor):
         small += ["--data.extractor.n_features", "20"]
+    if extractor["init_args"].get("backbone") == "resnet50":
+        small += ["--data.extractor.backbone", "efficientnet_lite0"]  # needs no download
     assert workplace.command("fit", "--config", config, "--data.root", room, *small) == 0
     (run,) = workplace.runs()
     baselines = [name for name, entry in BASELINES.items() if entry.clips == (kind == "ClipDataModule")]

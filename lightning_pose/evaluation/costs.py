@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import math
 import statistics
 import time
 from collections.abc import Callable
@@ -15,7 +17,7 @@ from lightning_pose.models.base import PoseModule
 from lightning_pose.runs.checkpoints import checkpoint_folder
 from lightning_pose.runs.recorder import read_train_seconds
 
-__all__ = ["costs", "count_layers"]
+__all__ = ["costs", "count_layers", "measure_weights"]
 
 
 def costs(
@@ -41,7 +43,8 @@ def costs(
         "cost/parameters": float(sum(p.numel() for p in module.network.parameters())),
         "cost/layers": float(count_layers(module.network)),
         "cost/ms_per_frame": _time_median(locate, len(held) - frames + 1) / frames,
-        "cost/frame_bytes": float(held[0].numel() * held.element_size()),
+        "cost/frame_bytes": float(math.prod(module.reduced_shape) * held.element_size()),
+        "cost/weights_bytes": float(measure_weights(module.network)),
     }
     if features:
         found["cost/features_ms_per_frame"] = _time_features(datamodule, split)
@@ -50,6 +53,16 @@ def costs(
         found["cost/checkpoint_bytes"] = float(best.stat().st_size)
     seconds = read_train_seconds(trainer)
     return found | ({"cost/train_seconds": seconds} if seconds else {})
+
+
+def measure_weights(network: nn.Module) -> int:
+    """Bytes of a file with a network's trained weights alone, as the thesis's table 5.1 counts them.
+
+    The checkpoint has more: buffers, such as principal components, and the settings that rebuild the model.
+    """
+    file = io.BytesIO()
+    torch.save({name: parameter.detach() for name, parameter in network.named_parameters()}, file)
+    return len(file.getvalue())
 
 
 def count_layers(module: nn.Module) -> int:

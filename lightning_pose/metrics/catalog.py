@@ -129,6 +129,7 @@ COSTS = {
     "ms_per_frame": Metric("network time per frame", "ms", "ms / frame"),
     "features_ms_per_frame": Metric("feature time per frame", "ms", "features ms / frame"),
     "frame_bytes": Metric("size of a frame's features", "bytes", "frame bytes"),
+    "weights_bytes": Metric("size of the trained weights", "bytes", "weights"),
     "checkpoint_bytes": Metric("size of the checkpoint", "bytes", "checkpoint", objective=False),
 }
 """What a localizer costs: `cost/NAME`."""

@@ -55,6 +55,7 @@ class PoseModule(LightningModule):
     | `setup` | seldom | what is learnt from the training split before the first step; call `super().setup` first |
     | `decode_features` | seldom | features to poses, where that takes more than one call of `network` |
     | `decode_batch` | seldom | the same for a batch, where training differs from use |
+    | `reduced_shape` | seldom | the shape of a frame's features once a fixed projection has reduced them |
     | `training_splits` | seldom | the splits whose poses end up in the weights |
     | `memory` | seldom | with `TrainingMemory`: what the checkpoint carries of every training frame |
     | `reads_clips`, `check_data`, `training_poses`, `select_judged` | for clips | see `ClipModule` |
@@ -143,6 +144,11 @@ class PoseModule(LightningModule):
     def headline(self) -> str:
         """The settings that distinguish runs of this architecture, for run names and tables."""
         return "x".join(map(str, self.input_shape))
+
+    @property
+    def reduced_shape(self) -> tuple[int, ...]:
+        """Shape of the numbers that a frame must be stored as for the trained layers; their size is a frame's cost."""
+        return self.input_shape
 
     @property
     def training_splits(self) -> tuple[str, ...]:

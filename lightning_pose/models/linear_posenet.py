@@ -42,6 +42,10 @@ class LinearPoseNet(ClosedFormModule):
     def headline(self) -> str:
         return f"D={self.input_shape[0]}" + (f" components={self.components}" if self.components else "")
 
+    @property
+    def reduced_shape(self) -> tuple[int, ...]:
+        return (self.components,) if self.components else self.input_shape
+
 
 class _FoldedLinear(LinearNetwork):
     """Seven numbers, linear in the features.

@@ -56,8 +56,10 @@ class NodePose(TrainingMemory, PoseModule):
         gap: training images are joined only if their places in the scene are at least this many frames apart; 1
             joins all, as the thesis does.
         full_graph_limit: up to this many training images every step computes the whole graph; with more, the part
-            that the batch depends on, with `fanout` neighbours of each node drawn at random.
-        fanout: see above.
+            that the batch depends on.
+        fanout: in that part, draw so many neighbours of each node at random, where their mean stands for that of all:
+            with `aggr: mean` of `wl` and SAGEConv. The sum or the maximum of a few is not that of all, which
+            validation and use compute; so other convolutions read every neighbour.
         **kwargs: what `PoseModule` takes.
 
     Raises:
@@ -149,7 +151,8 @@ class NodePose(TrainingMemory, PoseModule):
         rows, table = torch.searchsorted(self.memory_frame, batch.frame), self.memory_table
         features = self.memory_features
         if len(table) > self.full_graph_limit:
-            table = sample_neighbours(table, self.fanout)
+            if self.network.takes_means:
+                table = sample_neighbours(table, self.fanout)
             nodes, table, rows = find_neighbourhood(table, rows, hops=len(self.network.convolutions))
             features = features[nodes]
         *_, last = self.network.compute_states(self.standardize_input(features), table)
@@ -207,6 +210,11 @@ class _NodeNetwork(nn.Module):
         self.convolutions = nn.ModuleList(GraphConvolution(conv, *pair, aggr) for pair in pairwise(widths))
         self.dropout = nn.Dropout(dropout)
         self.heads = PoseHeads(widths[-1])
+
+    @property
+    def takes_means(self) -> bool:
+        """Whether each convolution reads nothing of a node's neighbours but their mean."""
+        return all(isinstance(layer, GraphConvolution) and layer.takes_mean for layer in self.convolutions)
 
     def forward(self, features: Tensor, states: list[Tensor], table: Tensor) -> Tensor:
         """Numbers of targets whose neighbours' states are known.

@@ -11,7 +11,8 @@ from lightning_pose.sweeps.space import BASE, MEASURES, Parameter, normalize_key
 
 __all__ = ["FigureSpec", "parse_figure_spec"]
 
-KINDS = ("line", "bar", "curve", "pictures")
+KINDS = ("line", "bar", "curve", "pictures", "neighbours")
+IN_THE_SCENE = ("pictures", "neighbours")  # they show no metric
 FIELDS = ("x", "y", "kind", "log", "beside", "title", "table", "labels")
 
 
@@ -21,8 +22,8 @@ class FigureSpec:
 
     Attributes:
         kind: `line` or `bar` over a setting; `curve` over whatever a trial's own curves run over, one line a trial;
-            `pictures` of keypoints.
-        x: the setting along the horizontal axis; empty for curves and pictures.
+            `pictures` of keypoints; `neighbours` of images, seen in the scene.
+        x: the setting along the horizontal axis; empty for all kinds but lines and bars.
         y: metrics, or curves, one panel each.
         log: which axes are logarithmic.
         beside: baselines that are drawn with the model, by name.
@@ -62,7 +63,7 @@ def parse_figure_spec(raw: object, measure: str | None, space: Sequence[Paramete
     if kind not in KINDS:
         raise ConfigError(f"figure.kind is {kind!r}; {suggest_name(str(kind), KINDS)}")
     y = _parse_names(raw.get("y", []), "y")
-    if not y and kind != "pictures":
+    if not y and kind not in IN_THE_SCENE:
         y = tuple(f"{'test' if measure == 'test' else 'val'}/{name}" for name in MEDIANS)
     table = _parse_names(raw.get("table", []), "table")
     for metric in (*y, *table):
@@ -81,14 +82,14 @@ def parse_figure_spec(raw: object, measure: str | None, space: Sequence[Paramete
         log=log,
         beside=_parse_names(raw.get("beside", []), "beside"),
         title=raw.get("title"),
-        table=table or (() if kind in ("curve", "pictures") else y),
+        table=table or (() if kind in ("curve", *IN_THE_SCENE) else y),
         labels=_parse_labels(raw.get("labels") or {}),
     )
 
 
 def _parse_axis(x: object, kind: str, space: Sequence[Parameter]) -> str:
     keys = [parameter.key for parameter in space]
-    if kind in ("curve", "pictures"):
+    if kind in ("curve", *IN_THE_SCENE):
         if x is not None:
             raise ConfigError(
                 f"figure.x is {x}, but a figure of kind {kind} has no setting along its axis; leave it out"

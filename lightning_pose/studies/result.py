@@ -11,6 +11,7 @@ from lightning_pose.errors import ConfigError
 from lightning_pose.features.keypoint_statistics import FrameKeypoints, read_frame_keypoints
 from lightning_pose.studies.figure import draw_groups, draw_keypoints
 from lightning_pose.studies.figure_spec import FigureSpec
+from lightning_pose.studies.neighbours import draw_neighbours, read_neighbours
 from lightning_pose.studies.table import Group, build_rows, read_groups, varying_settings, write_csv
 from lightning_pose.sweeps.base_config import ParsedConfig, open_keypoint_data
 from lightning_pose.sweeps.plan import Plan
@@ -37,6 +38,10 @@ def write_study(study: Study, plan: Plan, spec: FigureSpec, folder: Path) -> tup
     ended = [group for group in groups if group.metrics]
     if spec.kind == "pictures":
         figure = draw_keypoints(dict(_read_keypoints(plan, group) for group in ended), title)
+    elif spec.kind == "neighbours":
+        found = [read_neighbours(ParsedConfig(plan.arguments(group.values))) for group in ended]
+        names = [_title_panel(group, scene.scene) for group, scene in zip(ended, found, strict=True)]
+        figure = draw_neighbours(dict(zip(names, found, strict=True)), title)
     else:
         figure = draw_groups(ended, spec, title)
     heads, rows = build_rows(groups, spec)
@@ -58,6 +63,12 @@ def _read_keypoints(plan: Plan, group: Group) -> tuple[str, FrameKeypoints]:
     data, images = open_keypoint_data(ParsedConfig(plan.arguments(group.values)))
     frame = read_frame_keypoints(data.cache, data.scene.name, images)
     return group.names[SCENE] if group.values.get(SCENE) else frame.scene, frame
+
+
+def _title_panel(group: Group, scene: str) -> str:
+    """The scene's name, and the group's other settings."""
+    name = group.names[SCENE] if group.values.get(SCENE) else scene
+    return ", ".join([name, *(f"{key.rpartition('.')[2]} {text}" for key, text in group.names.items() if key != SCENE)])
 
 
 def _check_measured(groups: Sequence[Group], spec: FigureSpec) -> None:

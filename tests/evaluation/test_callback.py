@@ -63,6 +63,7 @@ def test_costs(trained: Trained) -> None:
     costs = {k.removeprefix("cost/"): v for k, v in trained.run.data.metrics.items() if k.startswith("cost/")}
     assert costs["parameters"] == 2 * 4 * 8 * (8 + 8 + 2) + 17 * 7
     assert costs["frame_bytes"] == 6 * 8 * 4
+    assert costs["weights_bytes"] < costs["checkpoint_bytes"]
     assert costs["checkpoint_bytes"] == trained.best.stat().st_size
     assert all(value > 0 for value in costs.values())
 

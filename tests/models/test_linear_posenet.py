@@ -16,6 +16,7 @@ from torch.utils.data import DataLoader
 
 from lightning_pose.data.batches import PoseBatch, PoseDataset, make_loader
 from lightning_pose.errors import ConfigError
+from lightning_pose.evaluation.costs import measure_weights
 from lightning_pose.geometry.quaternions import align_hemisphere
 from lightning_pose.losses import LossConfig
 from lightning_pose.models import LinearPoseNet
@@ -134,6 +135,13 @@ def test_the_thesis_counts_its_parameters(components: int | None, count: int, tm
     assert sum(parameter.numel() for parameter in model.network.parameters()) == count
     torch.save(model.state_dict(), tmp_path / "weights")
     assert (tmp_path / "weights").stat().st_size < 100_000
+
+
+@pytest.mark.parametrize(("components", "numbers"), [(None, 2048), (280, 280)])
+def test_components_save_bytes_of_frames_and_weights(components: int | None, numbers: int) -> None:
+    model = LinearPoseNet(input_shape=[2048], components=components)
+    assert model.reduced_shape == (numbers,)
+    assert 7 * numbers * 4 <= measure_weights(model.network) < 7 * numbers * 4 + 2500
 
 
 def test_headline_names_what_differs() -> None:

@@ -17,7 +17,7 @@ from lightning_pose.data.batches import PoseBatch
 from lightning_pose.errors import CheckpointError, ConfigError
 from lightning_pose.geometry.quaternions import align_hemisphere, orientation_error_deg
 from lightning_pose.models import NodePose
-from lightning_pose.models.parts.neighbour_graph import list_edges, search_neighbours
+from lightning_pose.models.parts.neighbour_graph import list_edges, sample_neighbours, search_neighbours
 from tests.models.helpers import LearnableProblem, random_poses
 
 WIDTH = 16
@@ -115,6 +115,33 @@ def test_a_sampled_graph_with_all_neighbours_is_the_full_graph() -> None:
     full = torch.cat(make().train().decode_batch(batch), dim=1)
     sampled = torch.cat(make(full_graph_limit=0).train().decode_batch(batch), dim=1)
     torch.testing.assert_close(sampled, full, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("aggr", [None, "add", "mean", "max"])
+@pytest.mark.parametrize("conv", ["wl", "gcn", "SAGEConv"])
+def test_above_the_limit_training_is_of_the_model_that_is_evaluated(conv: str, aggr: str | None) -> None:
+    batch, settings = frames(30), {"conv": conv, "aggr": aggr, "neighbours": 12, "neighbour_poses": 0}
+    full = torch.cat(make(**settings).train().decode_batch(batch), dim=1)
+    large = make(full_graph_limit=0, fanout=3, **settings).train()
+    trained = torch.cat(large.decode_batch(batch), dim=1)
+    if large.network.takes_means:
+        assert not torch.allclose(trained, full), "neighbours are drawn"
+        first = large.network.convolutions[0]
+        state = large.memory_features
+        exact = first(state, state, list_edges(large.memory_table))
+        drawn = [first(state, state, list_edges(sample_neighbours(large.memory_table, 3))) for _ in range(400)]
+        torch.testing.assert_close(torch.stack(drawn).mean(0), exact, atol=0.1, rtol=0)
+    else:
+        torch.testing.assert_close(trained, full, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("conv", "aggr", "takes"),
+    [("wl", "mean", True), ("SAGEConv", None, True), ("wl", None, False), ("wl", "max", False), ("gcn", None, False),
+     ("gcn", "mean", False), ("GATConv", "mean", False), ("TransformerConv", "mean", False)],
+)  # fmt: skip
+def test_neighbours_are_drawn_where_their_mean_is_all_that_counts(conv: str, aggr: str | None, takes: bool) -> None:
+    assert make(conv=conv, aggr=aggr).network.takes_means == takes
 
 
 def test_memory_is_in_the_order_of_frames() -> None:

@@ -12,6 +12,7 @@ from lightning_pose.errors import ConfigError
 __all__ = ["GraphConvolution", "PoseHeads"]
 
 _SHORT_NAMES = {"wl": "GraphConv", "gcn": "GCNConv"}
+_LINEAR_IN_MESSAGES = ("GraphConv", "SAGEConv")  # of a node's neighbours they read the joined messages alone
 
 
 class GraphConvolution(nn.Module):
@@ -25,6 +26,10 @@ class GraphConvolution(nn.Module):
         out_width: columns of its new state.
         aggr: how messages are joined: `add`, `mean` or `max`; the convolution's own way if not given, which for `gcn`
             is a mean.
+
+    Attributes:
+        takes_mean: whether the neighbours' mean is all that it reads of them, so that a random part of them stands for
+            all.
 
     Raises:
         ConfigError: there is no such convolution, or it cannot be built from two widths.
@@ -56,6 +61,7 @@ class GraphConvolution(nn.Module):
                 f"conv {conv!r} with aggr {aggr!r} cannot be built ({error}); give wl, gcn, or a convolution of "
                 "torch_geometric.nn from source to target nodes, such as SAGEConv or GATConv"
             ) from error
+        self.takes_mean = name in _LINEAR_IN_MESSAGES and getattr(self.layer, "aggr", None) == "mean"
         if shape != (1, out_width):
             raise ConfigError(f"conv {conv!r} answers with shape {tuple(shape)}, not {(1, out_width)}; give another")
 
