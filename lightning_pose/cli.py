@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import argparse
 import json
-import logging
-import re
-import warnings
 from pathlib import Path
 from typing import Any, NoReturn
 
 import torch
 import yaml
-from jsonargparse import DefaultHelpFormatter, Namespace, get_loader, set_loader
+from jsonargparse import Namespace
 from lightning import Trainer
-from lightning.pytorch.callbacks import Timer
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
-from lightning_pose.checkpoint import read_checkpoint, resolve_class_path, resolve_class_paths
+from lightning_pose.checkpoint import read_checkpoint
+from lightning_pose.commands.config_parser import (
+    PROGRAM,
+    REMEDY,
+    PoseParser,
+    join_message,
+    parser_settings,
+    rename_value,
+)
 from lightning_pose.data import SceneDataModule, require_clips
 from lightning_pose.errors import CheckpointError, ConfigError
 from lightning_pose.evaluation.callback import TestReport
@@ -26,7 +30,9 @@ from lightning_pose.localization.sequences import chain_test_split
 from lightning_pose.models import PoseModule
 from lightning_pose.paths import default_tracking_uri
 from lightning_pose.runs.checkpoints import BestCheckpoint, LastCheckpoint, checkpoint_folder
+from lightning_pose.runs.clock import TrainingClock
 from lightning_pose.runs.epoch_bar import EpochBar
+from lightning_pose.runs.lightning_messages import describe_refusal, filter_messages
 from lightning_pose.runs.logger import find_last_run
 from lightning_pose.runs.recorder import RunRecorder
 from lightning_pose.scenes.trajectory_files import write_sequences
@@ -34,112 +40,11 @@ from lightning_pose.scenes.trajectory_files import write_sequences
 __all__ = ["PoseCLI", "main"]
 
 
-class _HelpFormatter(argparse.RawDescriptionHelpFormatter, DefaultHelpFormatter):
-    """Keeps the examples as they are written."""
-
-
-PARSER_MODE = "yaml_with_renames"
-
-
-def load_with_renames(text: str) -> object:
-    """A YAML value in which classes have today's paths: a config's whole content, or one value of a command line."""
-    return resolve_class_paths(get_loader("yaml")(text))
-
-
-set_loader(PARSER_MODE, load_with_renames, exceptions=(yaml.YAMLError,))
-
-
-def _rename_value(word: str) -> str:
-    """A word of the command line, `VALUE` or `--NAME=VALUE`, an older class path in it replaced by today's."""
-    name, equals, value = word.rpartition("=")
-    return f"{name}{equals}{resolve_class_path(value)}"
-
-
-class PoseParser(LightningArgumentParser):
-    """A parser that replaces older class paths by today's, and raises ConfigError for a wrong setting.
-
-    So a wrong setting ends in one line, as every mistake of a user does.
-    """
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        # jsonargparse makes parsers of this class for nested settings too, with the mode of the outer parser.
-        settings: dict[str, Any] = {"formatter_class": _HelpFormatter, **kwargs, "parser_mode": PARSER_MODE}
-        super().__init__(*args, **settings)
-
-    def error(self, message: str, ex: Exception | None = None) -> NoReturn:
-        raise ConfigError(_one_line(message)) from ex
-
-
 SCENES = ("root", "train_scenes")
 """Settings of the data modules that say what a run trains on."""
 
-REMEDY = "`python -m lightning_pose fit --help` explains every setting"
-NOISE = re.compile(
-    r"Does not validate against any of the Union subtypes|Subtypes: .*|Errors:|Expected a <class 'NoneType'>"
-    r"|Given value type: .*|Given value: (NestedArg|Namespace|\{).*"
-)
-
-
-def _one_line(message: str) -> str:
-    """jsonargparse's message in one line, without its notes on types: which setting, and what is wrong with it."""
-    lines = [NOISE.sub("", line).strip(" -") for line in message.splitlines()]
-    text = " ".join(line for line in lines if line)
-    text = re.sub(r"<class '([^']+)'>", r"\1", re.sub(r'Parser key "([^"]+)":', r"\1:", text))
-    # A nested parser's message comes through here twice.
-    return text if text.endswith(REMEDY) else f"{text}; {REMEDY}"
-
-
-HELP = {
-    "fit": """Train a localizer, test its best checkpoint, and print it beside its baselines.
-
-  the built-in room      fit --config configs/quickstart.yaml
-  your data              fit --config configs/surf_lstm.yaml --data.root DIR
-  video, unseen scenes   fit --config configs/cnn_rnn.yaml --data.train_scenes "[DIR]" --data.test_scenes "[DIR]"
-  change any setting     ... --model.units 200 --data.extractor.n_features 100 --trainer.max_epochs 20
-  another seed           ... --seed_everything 1
-  go on after a stop     ... --ckpt_path last
-  see every run          mlflow ui --backend-store-uri sqlite:///mlruns/mlflow.db
-
-Settings of an architecture, a data module, a feature extractor:
-
-  fit --model.help lightning_pose.models.SurfLSTM
-  fit --data.help lightning_pose.data.ImageDataModule
-  fit --data lightning_pose.data.ImageDataModule --data.extractor.help lightning_pose.features.SURF""",
-    "validate": """Measure a checkpoint on the validation frames. The checkpoint knows its architecture and its data.
-
-  validate --ckpt_path mlruns/checkpoints/RUN_ID/best.ckpt""",
-    "test": """Measure a checkpoint on the test frames, beside its baselines, in a run of its own.
-The checkpoint knows its architecture and its data; both can be overridden.
-
-  test --ckpt_path mlruns/checkpoints/RUN_ID/best.ckpt
-  test --ckpt_path mlruns/checkpoints/RUN_ID/best.ckpt --data.root OTHER_COPY""",
-    "predict": """Write a checkpoint's poses of the test frames, one TUM file a sequence.
-
-  predict --ckpt_path mlruns/checkpoints/RUN_ID/best.ckpt""",
-    "extract": """Fill the feature cache that a config needs, on all cores; what is cached already is kept.
-
-  extract --config configs/surf_lstm.yaml --data.root DIR""",
-}
-
-
-PROGRAM = "python -m lightning_pose"
-
-
-def _parser_settings(verb: str) -> dict[str, str]:
-    return {
-        "prog": f"{PROGRAM} {verb}",
-        "usage": f"{PROGRAM} {verb} --config FILE [--SETTING VALUE ...]",
-        "description": HELP[verb],
-    }
-
-
-def _quiet_lightning() -> None:
-    """Drop messages of Lightning about devices, restored files and its own use of torch: no user can act on them."""
-    for name in ("lightning.pytorch", "lightning.fabric"):
-        logging.getLogger(name).setLevel(logging.WARNING)
-    warnings.filterwarnings("ignore", message=".*LeafSpec.*")  # Lightning's own use of torch
-    warnings.filterwarnings("ignore", message=".*torch.jit.script.* is deprecated")  # PyG's
-    warnings.filterwarnings("ignore", message=".*dirpath has changed|Checkpoint directory .* exists")  # resumed runs
+COUNTS = ("accumulate_grad_batches", "check_val_every_n_epoch", "log_every_n_steps")
+"""Settings of the trainer that are 1 or more; Lightning divides by them without a check."""
 
 
 class PoseCLI(LightningCLI):
@@ -151,7 +56,7 @@ class PoseCLI(LightningCLI):
     """
 
     def __init__(self, args: list[str], run: bool = True) -> None:
-        _quiet_lightning()
+        filter_messages()
         self.recorder = RunRecorder()
         self.verb_parsers: dict[str, LightningArgumentParser] = {}
         self._checkpoint: str | None = None
@@ -163,7 +68,7 @@ class PoseCLI(LightningCLI):
             save_config_callback=None,  # it asserts with a database logger; the recorder keeps the config
             trainer_defaults={
                 # The recorder comes first: a run has its name and tags before anything else can fail.
-                "callbacks": [self.recorder, Timer(), LastCheckpoint(), EpochBar()],
+                "callbacks": [self.recorder, TrainingClock(), LastCheckpoint(), EpochBar()],
                 "logger": {"class_path": "lightning_pose.runs.logger.MLflowLogger"},
                 "default_root_dir": "mlruns",
                 "enable_model_summary": False,
@@ -173,9 +78,9 @@ class PoseCLI(LightningCLI):
             auto_configure_optimizers=False,
             load_from_checkpoint_support=False,  # checkpoints carry their own plain settings
             parser_class=PoseParser,
-            parser_kwargs={verb: _parser_settings(verb) for verb in self.subcommands()}
+            parser_kwargs={verb: parser_settings(verb) for verb in self.subcommands()}
             if run
-            else _parser_settings("extract"),
+            else parser_settings("extract"),
             args=_with_saved_config(args) if run else args,
             run=run,
         )
@@ -189,7 +94,7 @@ class PoseCLI(LightningCLI):
     def parse_arguments(self, parser: LightningArgumentParser, args: list[str]) -> None:
         try:
             # Not Lightning's own, which warns that sys.argv is given as well.
-            self.config = parser.parse_args([_rename_value(word) for word in args])
+            self.config = parser.parse_args([rename_value(word) for word in args])
         except UnicodeDecodeError as error:
             raise ConfigError(f"the config is not text ({error}); give a YAML file") from error
         if "subcommand" in self.config:
@@ -204,7 +109,7 @@ class PoseCLI(LightningCLI):
         except ValueError as error:
             # jsonargparse wraps what a constructor refuses; the constructor's own words are among its lines.
             if str(error).startswith("Does not validate"):
-                raise ConfigError(_one_line(str(error))) from error
+                raise ConfigError(join_message(str(error))) from error
             raise
         self.model.check_data(self.datamodule)
 
@@ -240,6 +145,10 @@ class PoseCLI(LightningCLI):
             config, parser = self.config, self.parser
         else:
             config, parser = self.config[self.subcommand], self.verb_parsers[self.subcommand]
+        for name in COUNTS:
+            count = config.trainer[name]
+            if count is not None and count < 1:
+                raise ConfigError(f"trainer.{name} is {count}; give 1 or more")
         self.recorder.config_yaml = parser.dump(config, skip_unset=False)
         return super().instantiate_trainer(**kwargs)
 
@@ -332,11 +241,23 @@ def _check_resumable(checkpoint: str, config: Namespace) -> None:
 
 
 def main(argv: list[str]) -> int:
-    """Run one of LightningCLI's verbs; `argv` begins with it."""
+    """Run one of LightningCLI's verbs; `argv` begins with it.
+
+    Returns:
+        The exit code: 0 done, 143 asked to end.
+
+    Raises:
+        ConfigError: Lightning refuses a setting.
+    """
     try:
         PoseCLI(argv)
     except SIGTERMException:
         return 143
+    except Exception as error:
+        refusal = describe_refusal(error)
+        if refusal is None:
+            raise
+        raise ConfigError(f"{refusal}; {REMEDY}") from error
     except SystemExit as stop:
         # Lightning turns Ctrl-C into exit code 1, once it has closed the run.
         if stop.code == 1:

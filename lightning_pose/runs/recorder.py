@@ -7,7 +7,7 @@ import os
 import subprocess
 
 from lightning import LightningModule, Trainer
-from lightning.pytorch.callbacks import Callback, Timer
+from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from lightning_pose.data.datamodule import SceneDataModule, scene_datamodule
@@ -18,7 +18,7 @@ from lightning_pose.runs.logger import MLflowLogger
 from lightning_pose.runs.tags import OPERATIONAL
 from lightning_pose.scenes.images import read_gray
 
-__all__ = ["RunRecorder", "read_train_seconds"]
+__all__ = ["RunRecorder"]
 
 
 class RunRecorder(Callback):
@@ -92,12 +92,6 @@ class RunRecorder(Callback):
         if logger is not None and self.keeps_checkpoints:
             for file in sorted(checkpoint_folder(trainer).glob("*.ckpt")):
                 logger.client.log_artifact(str(logger.run_id), str(file), "checkpoints")
-
-
-def read_train_seconds(trainer: Trainer) -> float | None:
-    """Seconds spent in training, resumed parts included; None where nothing was trained."""
-    timers = [callback for callback in trainer.callbacks if isinstance(callback, Timer)]  # type: ignore[attr-defined]
-    return (timers[0].time_elapsed("train") or None) if timers else None
 
 
 def _collect_settings(trainer: Trainer, module: PoseModule) -> dict[str, object]:
