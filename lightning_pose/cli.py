@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, cast
 
 import torch
 import yaml
@@ -26,8 +26,10 @@ from lightning_pose.commands.config_parser import (
 from lightning_pose.data import SceneDataModule, require_clips
 from lightning_pose.errors import CheckpointError, ConfigError
 from lightning_pose.evaluation.callback import TestReport
+from lightning_pose.evaluation.gather import gather_poses
 from lightning_pose.localization.sequences import chain_test_split
 from lightning_pose.models import PoseModule
+from lightning_pose.models.parts.poses import Located, check_poses
 from lightning_pose.paths import default_tracking_uri
 from lightning_pose.runs.checkpoints import BestCheckpoint, LastCheckpoint, checkpoint_folder
 from lightning_pose.runs.clock import TrainingClock
@@ -155,27 +157,31 @@ class PoseCLI(LightningCLI):
     def after_fit(self) -> None:
         """Test the best checkpoint, in the same run; without one, after no epoch or a trial run, the model as it is."""
         best = checkpoint_folder(self.trainer) / "best.ckpt"
-        checkpoint = str(best) if best.is_file() else None
+        # Other processes than the first do not know the run, nor its folder.
+        checkpoint = self.trainer.strategy.broadcast(str(best) if best.is_file() else None)
         self.trainer.test(self.model, datamodule=self.datamodule, ckpt_path=checkpoint, verbose=False)
 
     def predict(self, model: PoseModule, datamodule: SceneDataModule, **kwargs: Any) -> None:
-        """Write one TUM file a sequence of the test split."""
+        """Write one TUM file a sequence of the test split.
+
+        Raises:
+            DataError: poses are not finite numbers.
+        """
         scene = datamodule.scene
         if model.reads_clips:
             datamodule.prepare_data()
             model.load_state_dict(read_checkpoint(kwargs["ckpt_path"])["state_dict"])
             chained = chain_test_split(model, require_clips(datamodule))
             rows, *poses = (torch.cat(parts) for parts in zip(*chained, strict=True))
-            numbers = datamodule.dataset("test").data.frame[rows].tolist()
+            located = Located(datamodule.dataset("test").data.frame[rows], *poses)
+            check_poses(located, type(model).__name__, "check the checkpoint and the images")
         else:
-            poses = map(
-                torch.cat, zip(*self.trainer.predict(model, datamodule=datamodule, **kwargs) or [], strict=True)
-            )
-            numbers = scene.splits["test"]
-        position_m, quat_wxyz = (part.numpy() for part in poses)
-        frames = [scene.frames[i] for i in numbers]
+            located = gather_poses(cast(list[Located], self.trainer.predict(model, datamodule=datamodule, **kwargs)))
+        if not self.trainer.is_global_zero:
+            return
+        frames = [scene.frames[i] for i in located.frame.tolist()]
         folder = Path(self.trainer.default_root_dir) / "predictions" / f"{type(model).__name__}-{scene.name}"
-        for file in write_sequences(folder, frames, position_m, quat_wxyz):
+        for file in write_sequences(folder, frames, located.position_m.numpy(), located.quat_wxyz.numpy()):
             print(file)
 
 

@@ -9,7 +9,7 @@ import warnings
 from pathlib import Path
 
 import lightning
-from lightning.pytorch.utilities.exceptions import MisconfigurationException
+from lightning.fabric.utilities.exceptions import MisconfigurationException
 
 __all__ = ["describe_refusal", "filter_messages"]
 
