@@ -9,7 +9,6 @@ from typing import Any, NoReturn, cast
 
 import torch
 import yaml
-from jsonargparse import Namespace
 from lightning import Trainer
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.utilities.exceptions import SIGTERMException
@@ -24,9 +23,10 @@ from lightning_pose.commands.config_parser import (
     rename_value,
 )
 from lightning_pose.data import SceneDataModule, require_clips
-from lightning_pose.errors import CheckpointError, ConfigError
+from lightning_pose.errors import ConfigError
 from lightning_pose.evaluation.callback import TestReport
 from lightning_pose.evaluation.gather import gather_poses
+from lightning_pose.evaluation.unseen import keep_unseen_frames
 from lightning_pose.localization.sequences import chain_test_split
 from lightning_pose.models import PoseModule
 from lightning_pose.models.parts.poses import Located, check_poses
@@ -37,6 +37,7 @@ from lightning_pose.runs.epoch_bar import EpochBar
 from lightning_pose.runs.lightning_messages import describe_refusal, filter_messages
 from lightning_pose.runs.logger import find_last_run
 from lightning_pose.runs.recorder import RunRecorder
+from lightning_pose.runs.resume import check_architecture, check_resumable, check_same_settings, is_complete, read_seed
 from lightning_pose.scenes.trajectory_files import write_sequences
 
 __all__ = ["PoseCLI", "main"]
@@ -60,6 +61,7 @@ class PoseCLI(LightningCLI):
     def __init__(self, args: list[str], run: bool = True) -> None:
         filter_messages()
         self.recorder = RunRecorder()
+        self.last = LastCheckpoint()
         self.verb_parsers: dict[str, LightningArgumentParser] = {}
         self._checkpoint: str | None = None
         super().__init__(
@@ -70,7 +72,7 @@ class PoseCLI(LightningCLI):
             save_config_callback=None,  # it asserts with a database logger; the recorder keeps the config
             trainer_defaults={
                 # The recorder comes first: a run has its name and tags before anything else can fail.
-                "callbacks": [self.recorder, TrainingClock(), LastCheckpoint(), EpochBar()],
+                "callbacks": [self.recorder, TrainingClock(), self.last, EpochBar()],
                 "logger": {"class_path": "lightning_pose.runs.logger.MLflowLogger"},
                 "default_root_dir": "mlruns",
                 "enable_model_summary": False,
@@ -114,6 +116,9 @@ class PoseCLI(LightningCLI):
                 raise ConfigError(join_message(str(error))) from error
             raise
         self.model.check_data(self.datamodule)
+        if self.subcommand == "fit" and self.config.fit.ckpt_path is not None:
+            specs = self.model.describe(), self.datamodule.describe()
+            check_same_settings(self.config.fit.ckpt_path, *specs, read_seed(), self.trainer.precision)
 
     def before_instantiate_classes(self) -> None:
         if self.subcommand is not None:
@@ -125,21 +130,24 @@ class PoseCLI(LightningCLI):
         elif self.subcommand == "fit" and self.config.fit.ckpt_path is not None:
             if self.config.fit.ckpt_path == "last":
                 self._continue_last_run()
-            _check_resumable(self.config.fit.ckpt_path, self.config.fit)
+            config = self.config.fit
+            check_resumable(config.ckpt_path, config.model.class_path, config.trainer.max_epochs, self.last.finishes)
 
     def _continue_last_run(self) -> None:
         config = self.config.fit
         logger = config.trainer.logger
         if not logger:
             raise ConfigError("trainer.logger is off, so no run is known; name the checkpoint in --ckpt_path")
+        uri = logger.init_args.tracking_uri or default_tracking_uri(logger.init_args.root)
         run_id, checkpoint = find_last_run(
-            uri=logger.init_args.tracking_uri or default_tracking_uri(logger.init_args.root),
+            uri=uri,
             experiment_name=logger.init_args.experiment_name,
             checkpoints=Path(config.trainer.default_root_dir) / "checkpoints",
             architecture=config.model.class_path.rpartition(".")[2],
             data={name: config.data.init_args[name] for name in SCENES if name in config.data.init_args},
         )
         logger.init_args.run_id = run_id
+        self.last.finishes = not is_complete(uri, run_id)
         config.ckpt_path = str(checkpoint)
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
@@ -160,6 +168,17 @@ class PoseCLI(LightningCLI):
         # Other processes than the first do not know the run, nor its folder.
         checkpoint = self.trainer.strategy.broadcast(str(best) if best.is_file() else None)
         self.trainer.test(self.model, datamodule=self.datamodule, ckpt_path=checkpoint, verbose=False)
+
+    def validate(self, model: PoseModule, datamodule: SceneDataModule, **kwargs: Any) -> None:
+        """Measure the model on validation frames that it has not learnt from.
+
+        Raises:
+            DataError: it has learnt from all of them.
+        """
+        left_out = keep_unseen_frames(read_checkpoint(kwargs["ckpt_path"]), model, datamodule)
+        self.trainer.validate(model, datamodule=datamodule, **kwargs)
+        if left_out and self.trainer.is_global_zero:
+            print(f"{left_out} validation frames are left out: the model has learnt from them")
 
     def predict(self, model: PoseModule, datamodule: SceneDataModule, **kwargs: Any) -> None:
         """Write one TUM file a sequence of the test split.
@@ -211,7 +230,7 @@ def _with_saved_config(args: list[str]) -> list[str]:
     if not options.config:
         settings["data"] = saved["data"]
     for file in options.config:
-        _check_architecture(options.ckpt_path, saved["model"]["class_path"], _architecture_of(file))
+        check_architecture(options.ckpt_path, saved["model"]["class_path"], _architecture_of(file))
     configs = [word for text in (*options.config, json.dumps(settings)) for word in ("--config", text)]
     return [args[0], *configs, *rest, "--ckpt_path", options.ckpt_path]
 
@@ -222,28 +241,6 @@ def _architecture_of(config: str) -> str | None:
         return yaml.safe_load(Path(config).read_text())["model"]["class_path"]
     except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError):
         return None  # the parser says what is wrong with it
-
-
-def _check_architecture(checkpoint: str, saved: str, asked: str | None) -> None:
-    """Refuse a config whose architecture is not the checkpoint's, before the two are mixed."""
-    if asked is not None and asked.rpartition(".")[2] != saved.rpartition(".")[2]:
-        raise CheckpointError(
-            f"{checkpoint} holds a {saved.rpartition('.')[2]}, but the config asks for {asked.rpartition('.')[2]}; "
-            "give the config it was trained with"
-        )
-
-
-def _check_resumable(checkpoint: str, config: Namespace) -> None:
-    """Refuse a checkpoint that training cannot go on from, before a run is opened for it."""
-    saved = read_checkpoint(checkpoint)
-    _check_architecture(checkpoint, saved["lightning_pose"]["model"]["class_path"], config.model.class_path)
-    if "optimizer_states" not in saved:
-        raise CheckpointError(f"{checkpoint} holds weights only, which can be tested; give the last.ckpt beside it")
-    epochs, most = saved["epoch"] + 1, config.trainer.max_epochs
-    if most is not None and 0 <= most <= epochs:
-        raise CheckpointError(
-            f"{checkpoint} has {epochs} epochs behind it and trainer.max_epochs is {most}; raise --trainer.max_epochs"
-        )
 
 
 def main(argv: list[str]) -> int:

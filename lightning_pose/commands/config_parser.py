@@ -76,7 +76,7 @@ HELP = {
   video, unseen scenes   fit --config configs/cnn_rnn.yaml --data.train_scenes "[DIR]" --data.test_scenes "[DIR]"
   change any setting     ... --model.units 200 --data.extractor.n_features 100 --trainer.max_epochs 20
   another seed           ... --seed_everything 1
-  go on after a stop     ... --ckpt_path last
+  go on after a stop     ... --ckpt_path last, with the same settings; --trainer.max_epochs may be raised
   see every run          mlflow ui --backend-store-uri sqlite:///mlruns/mlflow.db
 
 Settings of an architecture, a data module, a feature extractor:
@@ -84,7 +84,8 @@ Settings of an architecture, a data module, a feature extractor:
   fit --model.help lightning_pose.models.SurfLSTM
   fit --data.help lightning_pose.data.ImageDataModule
   fit --data lightning_pose.data.ImageDataModule --data.extractor.help lightning_pose.features.SURF""",
-    "validate": """Measure a checkpoint on the validation frames. The checkpoint knows its architecture and its data.
+    "validate": """Measure a checkpoint on the validation frames that it has not learnt from.
+The checkpoint knows its architecture and its data.
 
   validate --ckpt_path mlruns/checkpoints/RUN_ID/best.ckpt""",
     "test": """Measure a checkpoint on the test frames, beside its baselines, in a run of its own.

@@ -295,7 +295,8 @@ class PoseModule(CheckpointHooks):
             self.divergence.check_epoch(self._remedy)  # before this epoch's checkpoint is written
             self.divergence.check_error(errors["position_median_m"], self._remedy)
         named = {_name_loss(stage, name): value for name, value in losses.compute().items()}
-        self.log_dict(named | {f"{stage}/{name}": value for name, value in errors.items()})
+        # Every process has the same values, which `sync_dist` leaves as they are; without it Lightning warns.
+        self.log_dict(named | {f"{stage}/{name}": value for name, value in errors.items()}, sync_dist=True)
         metrics.reset()
         losses.reset()
 
