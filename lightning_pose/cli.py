@@ -34,7 +34,7 @@ from lightning_pose.paths import default_tracking_uri
 from lightning_pose.runs.checkpoints import BestCheckpoint, LastCheckpoint, checkpoint_folder
 from lightning_pose.runs.clock import TrainingClock
 from lightning_pose.runs.epoch_bar import EpochBar
-from lightning_pose.runs.lightning_messages import describe_refusal, filter_messages
+from lightning_pose.runs.lightning_messages import filter_messages
 from lightning_pose.runs.logger import find_last_run
 from lightning_pose.runs.recorder import RunRecorder
 from lightning_pose.runs.resume import check_architecture, check_resumable, check_same_settings, is_complete, read_seed
@@ -248,19 +248,11 @@ def main(argv: list[str]) -> int:
 
     Returns:
         The exit code: 0 done, 143 asked to end.
-
-    Raises:
-        ConfigError: Lightning refuses a setting.
     """
     try:
         PoseCLI(argv)
     except SIGTERMException:
         return 143
-    except Exception as error:
-        refusal = describe_refusal(error)
-        if refusal is None:
-            raise
-        raise ConfigError(f"{refusal}; {REMEDY}") from error
     except SystemExit as stop:
         # Lightning turns Ctrl-C into exit code 1, once it has closed the run.
         if stop.code == 1:

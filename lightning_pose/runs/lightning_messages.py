@@ -36,7 +36,7 @@ _filter = _ActionFilter()
 
 
 def filter_messages() -> None:
-    """Show what Lightning says about settings; drop the rest, and the warnings of libraries that no user can act on."""
+    """Show messages of Lightning on settings; drop the others, and warnings of libraries that no user can act on."""
     for name in ("lightning", "lightning.pytorch", "lightning.fabric"):
         for handler in logging.getLogger(name).handlers:
             handler.addFilter(_filter)  # of handlers, because a logger's own filters do not see its children's records

@@ -42,6 +42,16 @@ def test_a_metric_that_does_not_exist(workplace: Workplace, capsys: pytest.Captu
     assert workplace.runs()[0].info.status == "FAILED"
 
 
+@pytest.mark.parametrize("verb", ["fit", "extract"])
+def test_every_command_says_what_lightning_refuses(
+    verb: str, workplace: Workplace, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert workplace.run(verb, "--trainer.devices", "0") == 2
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert line.startswith("error: `Trainer(devices='0')`")
+    assert line.endswith(f"`python -m lightning_pose {verb} --help` explains every setting")
+
+
 @pytest.mark.parametrize(
     ("message", "shown"),
     [

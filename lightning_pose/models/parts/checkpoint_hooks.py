@@ -21,7 +21,7 @@ LEARNT_FRAMES = "learnt_frames"
 
 
 def key_frame(frame: Frame) -> int:
-    """A number in 64 bits that tells a frame by its pose, wherever the dataset is, and however it is split."""
+    """A number in 64 bits that identifies a frame by its pose, wherever the dataset is, and however it is split."""
     pose = np.concatenate([frame.position_m, frame.quat_wxyz]).round(6) + 0.0  # no negative zero
     return int.from_bytes(hashlib.blake2b(pose.tobytes(), digest_size=8).digest(), "little", signed=True)
 
