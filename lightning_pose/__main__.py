@@ -79,7 +79,9 @@ def _find_refusal(error: Exception) -> str | None:
     """Lightning's words where it refuses a setting; it is imported already if it does."""
     if "lightning" not in sys.modules:
         return None
-    return import_module("lightning_pose.runs.lightning_messages").describe_refusal(error)
+    from lightning_pose.runs.lightning_messages import describe_refusal
+
+    return describe_refusal(error)
 
 
 LIGHTNING_VERBS = tuple(verb for verb, (module, _) in VERBS.items() if module == "lightning_pose.cli")
