@@ -16,7 +16,6 @@ from pathlib import Path
 
 import torch
 from lightning import Callback, Trainer
-from lightning.pytorch.callbacks import Timer
 
 from lightning_pose import models
 from lightning_pose.checkpoint import Spec
@@ -25,6 +24,7 @@ from lightning_pose.data.batches import PoseBatch, PoseDataset, make_loader
 from lightning_pose.features import SURF
 from lightning_pose.geometry.quaternions import align_hemisphere, quat_normalize
 from lightning_pose.runs.checkpoints import BestCheckpoint, LastCheckpoint
+from lightning_pose.runs.clock import TrainingClock
 from lightning_pose.runs.epoch_bar import EpochBar
 from lightning_pose.runs.logger import MLflowLogger
 from lightning_pose.runs.recorder import RunRecorder
@@ -85,7 +85,7 @@ def fitted(model: models.PoseModule, data: RandomData, epochs: int) -> float:
             max_epochs=epochs + 1,
             accelerator="cpu",
             logger=MLflowLogger(root=root, tracking_uri=f"sqlite:///{root}/mlflow.db"),
-            callbacks=[RunRecorder(), Timer(), LastCheckpoint(), EpochBar(), BestCheckpoint(), clock],
+            callbacks=[RunRecorder(), TrainingClock(), LastCheckpoint(), EpochBar(), BestCheckpoint(), clock],
             default_root_dir=root,
             enable_model_summary=False,
             log_every_n_steps=1,

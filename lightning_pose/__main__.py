@@ -11,6 +11,8 @@ from lightning_pose.errors import PoseError
 
 __all__ = ["main"]
 
+PROGRAM = "python -m lightning_pose"
+
 VERBS = {
     "fit": ("lightning_pose.cli", "train a localizer, test it, and print it beside its baselines"),
     "validate": ("lightning_pose.cli", "measure a checkpoint on the validation frames"),
@@ -75,9 +77,24 @@ def main(argv: list[str] | None = None) -> int:
             file=sys.stderr,
         )
         return 2
+    except Exception as error:
+        refusal = _find_refusal(error)
+        if refusal is None:
+            raise
+        print(f"error: {refusal}; `{PROGRAM} {verb} --help` explains every setting", file=sys.stderr)
+        return 2
     except KeyboardInterrupt as stop:
         print("; ".join(["interrupted", *map(str, stop.args)]), file=sys.stderr)
         return 130
+
+
+def _find_refusal(error: Exception) -> str | None:
+    """Lightning's words where it refuses a setting; it is imported already if it does."""
+    if "lightning" not in sys.modules:
+        return None
+    from lightning_pose.runs.lightning_messages import describe_refusal
+
+    return describe_refusal(error)
 
 
 LIGHTNING_VERBS = tuple(verb for verb, (module, _) in VERBS.items() if module == "lightning_pose.cli")

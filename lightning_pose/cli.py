@@ -5,137 +5,45 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
-import logging
-import warnings
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, cast
 
 import torch
 import yaml
-from jsonargparse import DefaultHelpFormatter, Namespace, get_loader, set_loader
 from lightning import Trainer
-from lightning.pytorch.callbacks import Timer
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
-from lightning_pose.checkpoint import (
-    check_specs,
-    find_class_paths,
-    read_checkpoint,
-    resolve_class_path,
-    resolve_class_paths,
-)
+from lightning_pose.checkpoint import check_specs, find_class_paths, read_checkpoint
+from lightning_pose.commands.config_parser import ALLOW_HELP, PROGRAM, PoseParser, parser_settings, rename_value
 from lightning_pose.commands.setting_errors import REMEDY, explain_setting_error
 from lightning_pose.data import SceneDataModule, require_clips
-from lightning_pose.errors import CheckpointError, ConfigError
+from lightning_pose.errors import ConfigError
 from lightning_pose.evaluation.callback import TestReport
+from lightning_pose.evaluation.gather import gather_poses
+from lightning_pose.evaluation.unseen import keep_unseen_frames
 from lightning_pose.localization.sequences import chain_test_split
 from lightning_pose.models import PoseModule
+from lightning_pose.models.parts.poses import Located, check_poses
 from lightning_pose.paths import default_tracking_uri
 from lightning_pose.runs.checkpoints import BestCheckpoint, LastCheckpoint, checkpoint_folder
+from lightning_pose.runs.clock import TrainingClock
 from lightning_pose.runs.epoch_bar import EpochBar
+from lightning_pose.runs.lightning_messages import filter_messages
 from lightning_pose.runs.logger import find_last_run
 from lightning_pose.runs.recorder import RunRecorder
+from lightning_pose.runs.resume import check_architecture, check_resumable, check_same_settings, is_complete, read_seed
 from lightning_pose.scenes.trajectory_files import write_sequences
 
 __all__ = ["PoseCLI", "main"]
 
 
-class _HelpFormatter(argparse.RawDescriptionHelpFormatter, DefaultHelpFormatter):
-    """Keeps the examples as they are written."""
-
-
-PARSER_MODE = "yaml_with_renames"
-
-
-def load_with_renames(text: str) -> object:
-    """A YAML value in which classes have today's paths: a config's whole content, or one value of a command line."""
-    return resolve_class_paths(get_loader("yaml")(text))
-
-
-set_loader(PARSER_MODE, load_with_renames, exceptions=(yaml.YAMLError,))
-
-
-def _rename_value(word: str) -> str:
-    """A word of the command line, `VALUE` or `--NAME=VALUE`, an older class path in it replaced by today's."""
-    name, equals, value = word.rpartition("=")
-    return f"{name}{equals}{resolve_class_path(value)}"
-
-
-class PoseParser(LightningArgumentParser):
-    """A parser that replaces older class paths by today's, and raises ConfigError for a wrong setting.
-
-    So a wrong setting ends in one line, as every mistake of a user does.
-    """
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        # jsonargparse makes parsers of this class for nested settings too, with the mode of the outer parser.
-        settings: dict[str, Any] = {"formatter_class": _HelpFormatter, **kwargs, "parser_mode": PARSER_MODE}
-        super().__init__(*args, **settings)
-
-    def error(self, message: str, ex: Exception | None = None) -> NoReturn:
-        raise ConfigError(explain_setting_error(message)) from ex
-
-
 SCENES = ("root", "train_scenes")
 """Settings of the data modules that say what a run trains on."""
 
-HELP = {
-    "fit": """Train a localizer, test its best checkpoint, and print it beside its baselines.
-
-  the built-in room      fit --config configs/quickstart.yaml
-  your data              fit --config configs/surf_lstm.yaml --data.root DIR
-  video, unseen scenes   fit --config configs/cnn_rnn.yaml --data.train_scenes "[DIR]" --data.test_scenes "[DIR]"
-  change any setting     ... --model.units 200 --data.extractor.n_features 100 --trainer.max_epochs 20
-  another seed           ... --seed_everything 1
-  go on after a stop     ... --ckpt_path last
-  see every run          mlflow ui --backend-store-uri sqlite:///mlruns/mlflow.db
-
-Settings of an architecture, a data module, a feature extractor:
-
-  fit --model.help lightning_pose.models.SurfLSTM
-  fit --data.help lightning_pose.data.ImageDataModule
-  fit --data lightning_pose.data.ImageDataModule --data.extractor.help lightning_pose.features.SURF""",
-    "validate": """Measure a checkpoint on the validation frames. The checkpoint knows its architecture and its data.
-
-  validate --ckpt_path mlruns/checkpoints/RUN_ID/best.ckpt""",
-    "test": """Measure a checkpoint on the test frames, beside its baselines, in a run of its own.
-The checkpoint knows its architecture and its data; both can be overridden.
-
-  test --ckpt_path mlruns/checkpoints/RUN_ID/best.ckpt
-  test --ckpt_path mlruns/checkpoints/RUN_ID/best.ckpt --data.root OTHER_COPY
-  test --ckpt_path FILE --allow my_package.MyNet      a checkpoint that names a class of your own""",
-    "predict": """Write a checkpoint's poses of the test frames, one TUM file a sequence.
-
-  predict --ckpt_path mlruns/checkpoints/RUN_ID/best.ckpt""",
-    "extract": """Fill the feature cache that a config needs, on all cores; what is cached already is kept.
-
-  extract --config configs/surf_lstm.yaml --data.root DIR""",
-}
-
-
-ALLOW_HELP = """Class path, or package, of your own architecture, extractor or backbone that the checkpoint may name.
-May be given several times. Classes of this package, and those that your config or command line names, are allowed."""
-
-PROGRAM = "python -m lightning_pose"
-
-
-def _parser_settings(verb: str) -> dict[str, str]:
-    return {
-        "prog": f"{PROGRAM} {verb}",
-        "usage": f"{PROGRAM} {verb} --config FILE [--SETTING VALUE ...]",
-        "description": HELP[verb],
-    }
-
-
-def _quiet_lightning() -> None:
-    """Drop messages of Lightning about devices, restored files and its own use of torch: no user can act on them."""
-    for name in ("lightning.pytorch", "lightning.fabric"):
-        logging.getLogger(name).setLevel(logging.WARNING)
-    warnings.filterwarnings("ignore", message=".*LeafSpec.*")  # Lightning's own use of torch
-    warnings.filterwarnings("ignore", message=".*torch.jit.script.* is deprecated")  # PyG's
-    warnings.filterwarnings("ignore", message=".*dirpath has changed|Checkpoint directory .* exists")  # resumed runs
+COUNTS = ("accumulate_grad_batches", "check_val_every_n_epoch", "log_every_n_steps")
+"""Settings of the trainer that are 1 or more; Lightning divides by them without a check."""
 
 
 class PoseCLI(LightningCLI):
@@ -147,8 +55,9 @@ class PoseCLI(LightningCLI):
     """
 
     def __init__(self, args: list[str], run: bool = True) -> None:
-        _quiet_lightning()
+        filter_messages()
         self.recorder = RunRecorder()
+        self.last = LastCheckpoint()
         self.verb_parsers: dict[str, LightningArgumentParser] = {}
         self._checkpoint: str | None = None
         super().__init__(
@@ -159,7 +68,7 @@ class PoseCLI(LightningCLI):
             save_config_callback=None,  # it asserts with a database logger; the recorder keeps the config
             trainer_defaults={
                 # The recorder comes first: a run has its name and tags before anything else can fail.
-                "callbacks": [self.recorder, Timer(), LastCheckpoint(), EpochBar()],
+                "callbacks": [self.recorder, TrainingClock(), self.last, EpochBar()],
                 "logger": {"class_path": "lightning_pose.runs.logger.MLflowLogger"},
                 "default_root_dir": "mlruns",
                 "enable_model_summary": False,
@@ -169,9 +78,9 @@ class PoseCLI(LightningCLI):
             auto_configure_optimizers=False,
             load_from_checkpoint_support=False,  # checkpoints carry their own plain settings
             parser_class=PoseParser,
-            parser_kwargs={verb: _parser_settings(verb) for verb in self.subcommands()}
+            parser_kwargs={verb: parser_settings(verb) for verb in self.subcommands()}
             if run
-            else _parser_settings("extract"),
+            else parser_settings("extract"),
             args=_with_saved_config(args) if run else _require_config("extract", args),
             run=run,
         )
@@ -187,7 +96,7 @@ class PoseCLI(LightningCLI):
     def parse_arguments(self, parser: LightningArgumentParser, args: list[str]) -> None:
         try:
             # Not Lightning's own, which warns that sys.argv is given as well.
-            self.config = parser.parse_args([_rename_value(word) for word in args])
+            self.config = parser.parse_args([rename_value(word) for word in args])
         except UnicodeDecodeError as error:
             raise ConfigError(f"the config is not text ({error}); give a YAML file") from error
         if "subcommand" in self.config:
@@ -205,6 +114,9 @@ class PoseCLI(LightningCLI):
                 raise ConfigError(explain_setting_error(str(error))) from error
             raise
         self.model.check_data(self.datamodule)
+        if self.subcommand == "fit" and self.config.fit.ckpt_path is not None:
+            specs = self.model.describe(), self.datamodule.describe()
+            check_same_settings(self.config.fit.ckpt_path, *specs, read_seed(), self.trainer.precision)
 
     def before_instantiate_classes(self) -> None:
         if self.subcommand is not None:
@@ -216,21 +128,24 @@ class PoseCLI(LightningCLI):
         elif self.subcommand == "fit" and self.config.fit.ckpt_path is not None:
             if self.config.fit.ckpt_path == "last":
                 self._continue_last_run()
-            _check_resumable(self.config.fit.ckpt_path, self.config.fit)
+            config = self.config.fit
+            check_resumable(config.ckpt_path, config.model.class_path, config.trainer.max_epochs, self.last.finishes)
 
     def _continue_last_run(self) -> None:
         config = self.config.fit
         logger = config.trainer.logger
         if not logger:
             raise ConfigError("trainer.logger is off, so no run is known; name the checkpoint in --ckpt_path")
+        uri = logger.init_args.tracking_uri or default_tracking_uri(logger.init_args.root)
         run_id, checkpoint = find_last_run(
-            uri=logger.init_args.tracking_uri or default_tracking_uri(logger.init_args.root),
+            uri=uri,
             experiment_name=logger.init_args.experiment_name,
             checkpoints=Path(config.trainer.default_root_dir) / "checkpoints",
             architecture=config.model.class_path.rpartition(".")[2],
             data={name: config.data.init_args[name] for name in SCENES if name in config.data.init_args},
         )
         logger.init_args.run_id = run_id
+        self.last.finishes = not is_complete(uri, run_id)
         config.ckpt_path = str(checkpoint)
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
@@ -238,33 +153,52 @@ class PoseCLI(LightningCLI):
             config, parser = self.config, self.parser
         else:
             config, parser = self.config[self.subcommand], self.verb_parsers[self.subcommand]
+        for name in COUNTS:
+            count = config.trainer[name]
+            if count is not None and count < 1:
+                raise ConfigError(f"trainer.{name} is {count}; give 1 or more")
         self.recorder.config_yaml = parser.dump(config, skip_unset=False)
         return super().instantiate_trainer(**kwargs)
 
     def after_fit(self) -> None:
         """Test the best checkpoint, in the same run; without one, after no epoch or a trial run, the model as it is."""
         best = checkpoint_folder(self.trainer) / "best.ckpt"
-        checkpoint = str(best) if best.is_file() else None
+        # Other processes than the first do not know the run, nor its folder.
+        checkpoint = self.trainer.strategy.broadcast(str(best) if best.is_file() else None)
         self.trainer.test(self.model, datamodule=self.datamodule, ckpt_path=checkpoint, verbose=False)
 
+    def validate(self, model: PoseModule, datamodule: SceneDataModule, **kwargs: Any) -> None:
+        """Measure the model on validation frames that it has not learnt from.
+
+        Raises:
+            DataError: it has learnt from all of them.
+        """
+        left_out = keep_unseen_frames(read_checkpoint(kwargs["ckpt_path"]), model, datamodule)
+        self.trainer.validate(model, datamodule=datamodule, **kwargs)
+        if left_out and self.trainer.is_global_zero:
+            print(f"{left_out} validation frames are left out: the model has learnt from them")
+
     def predict(self, model: PoseModule, datamodule: SceneDataModule, **kwargs: Any) -> None:
-        """Write one TUM file a sequence of the test split."""
+        """Write one TUM file a sequence of the test split.
+
+        Raises:
+            DataError: poses are not finite numbers.
+        """
         scene = datamodule.scene
         if model.reads_clips:
             datamodule.prepare_data()
             model.load_state_dict(read_checkpoint(kwargs["ckpt_path"])["state_dict"])
             chained = chain_test_split(model, require_clips(datamodule))
             rows, *poses = (torch.cat(parts) for parts in zip(*chained, strict=True))
-            numbers = datamodule.dataset("test").data.frame[rows].tolist()
+            located = Located(datamodule.dataset("test").data.frame[rows], *poses)
+            check_poses(located, type(model).__name__, "check the checkpoint and the images")
         else:
-            poses = map(
-                torch.cat, zip(*self.trainer.predict(model, datamodule=datamodule, **kwargs) or [], strict=True)
-            )
-            numbers = scene.splits["test"]
-        position_m, quat_wxyz = (part.numpy() for part in poses)
-        frames = [scene.frames[i] for i in numbers]
+            located = gather_poses(cast(list[Located], self.trainer.predict(model, datamodule=datamodule, **kwargs)))
+        if not self.trainer.is_global_zero:
+            return
+        frames = [scene.frames[i] for i in located.frame.tolist()]
         folder = Path(self.trainer.default_root_dir) / "predictions" / f"{type(model).__name__}-{scene.name}"
-        for file in write_sequences(folder, frames, position_m, quat_wxyz):
+        for file in write_sequences(folder, frames, located.position_m.numpy(), located.quat_wxyz.numpy()):
             print(file)
 
 
@@ -296,7 +230,7 @@ def _with_saved_config(args: list[str]) -> list[str]:
     model, data = saved["model"], saved["data"]
     assert model is not None
     for file in options.config:
-        _check_architecture(options.ckpt_path, model["class_path"], _architecture_of(file))
+        check_architecture(options.ckpt_path, model["class_path"], _architecture_of(file))
     model["init_args"].pop("input_shape", None)  # it follows from the data
     settings = {"model": model} | ({} if options.config or data is None else {"data": data})
     configs = [word for text in (*options.config, json.dumps(settings)) for word in ("--config", text)]
@@ -339,30 +273,12 @@ def _architecture_of(config: str) -> str | None:
         return None  # the parser says what is wrong with it
 
 
-def _check_architecture(checkpoint: str, saved: str, asked: str | None) -> None:
-    """Refuse a config whose architecture is not the checkpoint's, before the two are mixed."""
-    if asked is not None and asked.rpartition(".")[2] != saved.rpartition(".")[2]:
-        raise CheckpointError(
-            f"{checkpoint} holds a {saved.rpartition('.')[2]}, but the config asks for {asked.rpartition('.')[2]}; "
-            "give the config it was trained with"
-        )
-
-
-def _check_resumable(checkpoint: str, config: Namespace) -> None:
-    """Refuse a checkpoint that training cannot go on from, before a run is opened for it."""
-    saved = read_checkpoint(checkpoint)
-    _check_architecture(checkpoint, saved["lightning_pose"]["model"]["class_path"], config.model.class_path)
-    if "optimizer_states" not in saved:
-        raise CheckpointError(f"{checkpoint} holds weights only, which can be tested; give the last.ckpt beside it")
-    epochs, most = saved["epoch"] + 1, config.trainer.max_epochs
-    if most is not None and 0 <= most <= epochs:
-        raise CheckpointError(
-            f"{checkpoint} has {epochs} epochs behind it and trainer.max_epochs is {most}; raise --trainer.max_epochs"
-        )
-
-
 def main(argv: list[str]) -> int:
-    """Run one of LightningCLI's verbs; `argv` begins with it."""
+    """Run one of LightningCLI's verbs; `argv` begins with it.
+
+    Returns:
+        The exit code: 0 done, 143 asked to end.
+    """
     try:
         PoseCLI(argv)
     except SIGTERMException:

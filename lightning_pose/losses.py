@@ -88,7 +88,8 @@ class PoseLoss(nn.Module):
         quat_hat: Float[Tensor, "*predicted 4"],
         position: Float[Tensor, "*true 3"],
         quat: Float[Tensor, "*true 4"],
-    ) -> dict[str, Float[Tensor, ""]]:
+        by_item: bool = False,
+    ) -> dict[str, Float[Tensor, "*items"]]:
         """The loss of predicted poses, and its terms.
 
         Args:
@@ -96,6 +97,7 @@ class PoseLoss(nn.Module):
             quat_hat: predicted wxyz, as the network returns it.
             position: true, of the same shape.
             quat: true wxyz, unit, in one hemisphere.
+            by_item: return each term as (B,), one value for each frame or clip; their mean is the loss.
 
         Returns:
             `position` and `orientation`, unweighted; `trajectory`, unweighted, if it has a weight; and `total`.
@@ -112,13 +114,14 @@ class PoseLoss(nn.Module):
         if config.normalize_quat:
             quat_hat = quat_normalize(quat_hat)
         error_p, error_q = position_hat - position, quat_hat - quat
-        terms = {"position": self._norm(error_p).mean(), "orientation": self._norm(error_q).mean()}
+        mean = _mean_by_item if by_item else torch.mean
+        terms = {"position": mean(self._norm(error_p)), "orientation": mean(self._norm(error_q))}
         if config.trajectory_weight:
-            terms["trajectory"] = self._trajectory(error_p)
+            terms["trajectory"] = mean(self._trajectory(error_p))
         drift = config.trajectory_weight * terms.get("trajectory", 0.0)
         if config.form == "joint":
             error = torch.cat([error_p, config.orientation_weight * error_q], dim=-1)
-            total = self._norm(error).mean() + drift
+            total = mean(self._norm(error)) + drift
         elif config.learned_weights:
             s_p, s_q = self.log_scale_position, self.log_scale_orientation
             total = (terms["position"] + drift) * torch.exp(-s_p) + s_p
@@ -135,7 +138,7 @@ class PoseLoss(nn.Module):
         return torch.linalg.vector_norm(error, dim=-1)
 
     def _trajectory(self, error_p: Tensor) -> Tensor:
-        """Norm of the position error summed over a clip's T frames, divided by T.
+        """Norm of each clip's position error summed over its T frames, divided by T.
 
         Eq. 6.2 sums its position and orientation terms over the T frames; here they are means. With this term divided
         by T as well, the total is eq. 6.2 divided by T.
@@ -145,4 +148,9 @@ class PoseLoss(nn.Module):
                 f"trajectory_weight is {self.config.trajectory_weight} but the positions, "
                 f"{tuple(error_p.shape)}, have no time axis; use clips (B, T, 3) or set trajectory_weight: 0"
             )
-        return self._norm(error_p.sum(-2)).mean() / error_p.shape[-2]
+        return self._norm(error_p.sum(-2)) / error_p.shape[-2]
+
+
+def _mean_by_item(values: Tensor) -> Tensor:
+    """(B, ...) -> (B,)."""
+    return values if values.ndim == 1 else values.flatten(1).mean(1)

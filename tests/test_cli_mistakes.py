@@ -102,6 +102,15 @@ def test_data(
         (["--model.unitz", "8"], "unitz.*--help"),
         (["--datum", "8"], "--datum.*--help"),
         (["--config"], "config.*expected"),
+        (["--trainer.accelerator", "cuda"], "cuda|CUDA|gpu"),
+        (["--trainer.devices", "0"], r"devices='0'.* is not a valid input.*--help"),
+        (["--trainer.enable_checkpointing", "false"], "enable_checkpointing=False.*--help"),
+        (["--trainer.strategy", "none"], "strategy='none'.*--help"),
+        (["--trainer.limit_train_batches", "2.5"], "2.5 for limit_train_batches.*--help"),
+        (["--trainer.profiler", "nothing"], "profiler.*'simple'"),
+        (["--trainer.max_time", "soon"], "duration='soon'.*DD:HH:MM:SS"),
+        (["--trainer.accumulate_grad_batches", "0"], "accumulate_grad_batches is 0; give 1 or more"),
+        (["--trainer.check_val_every_n_epoch", "0"], "check_val_every_n_epoch is 0; give 1 or more"),
     ],
 )
 def test_setting(args: list[str], says: str, complaint: Complaint, workplace: Workplace) -> None:

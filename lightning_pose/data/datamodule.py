@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -88,6 +89,11 @@ class SceneDataModule(LightningDataModule):
         if self._scene is None:
             self._scene = self._load_scene()
         return self._scene
+
+    def replace_split(self, split: str, indices: np.ndarray) -> None:
+        """Give a split other frames, indices into `Scene.frames`."""
+        self._scene = replace(self.scene, splits={**self.scene.splits, split: indices})
+        self._datasets.pop(split, None)
 
     def prepare_data(self) -> None:
         self.fill()

@@ -11,10 +11,12 @@ from lightning.pytorch.callbacks import Callback
 
 from lightning_pose.data.datamodule import scene_datamodule
 from lightning_pose.evaluation.clips import evaluate_clips
+from lightning_pose.evaluation.gather import gather_poses
 from lightning_pose.evaluation.images import evaluate_images
 from lightning_pose.evaluation.result import Evaluation
 from lightning_pose.evaluation.table import print_results, results_markdown
 from lightning_pose.models.base import Pose, PoseModule
+from lightning_pose.models.parts.poses import Located
 from lightning_pose.runs.checkpoints import checkpoint_folder, run_logger
 from lightning_pose.runs.logger import MLflowLogger, log_localizer
 from lightning_pose.runs.tags import NOTE
@@ -39,17 +41,19 @@ class TestReport(Callback):
         self.visual_odometry = visual_odometry
         self.results: dict[str, Mapping[str, float]] = {}
         self.evaluation: Evaluation | None = None
-        self._poses: list[Pose] = []
+        self._batches: list[Located] = []
 
     def on_test_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._poses = []
+        self._batches = []
 
     def on_test_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Pose, *args: object, **kwargs: object
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Located, *args: object, **kwargs: object
     ) -> None:
-        self._poses.append(Pose(outputs.position_m.double().cpu(), outputs.quat_wxyz.float().cpu()))
+        self._batches.append(outputs)
 
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        assert isinstance(pl_module, PoseModule)
+        located = None if pl_module.reads_clips else gather_poses(self._batches)
         if not trainer.is_global_zero:
             return
         model = {
@@ -57,11 +61,10 @@ class TestReport(Callback):
             for name, value in trainer.callback_metrics.items()
             if name.startswith("test/")
         }
-        assert isinstance(pl_module, PoseModule)
-        if pl_module.reads_clips:
+        if located is None:
             found = evaluate_clips(trainer, pl_module, model, self.visual_odometry)
         else:
-            found = evaluate_images(trainer, pl_module, self._poses, model)
+            found = evaluate_images(trainer, pl_module, located, model)
         self.evaluation = found
         self.results = {type(pl_module).__name__: model, **found.rows, **found.baselines}
         scene = scene_datamodule(trainer).scene

@@ -15,7 +15,7 @@ from torch import nn
 from lightning_pose.data.datamodule import SceneDataModule, scene_datamodule
 from lightning_pose.models.base import PoseModule
 from lightning_pose.runs.checkpoints import checkpoint_folder
-from lightning_pose.runs.recorder import read_train_seconds
+from lightning_pose.runs.clock import read_train_seconds, wait_for_device
 
 __all__ = ["costs", "count_layers", "measure_weights"]
 
@@ -41,6 +41,7 @@ def costs(
 
     found = {
         "cost/parameters": float(sum(p.numel() for p in module.network.parameters())),
+        "cost/carried_numbers": float(sum(tensor.numel() for tensor in module.state_dict().values())),
         "cost/layers": float(count_layers(module.network)),
         "cost/ms_per_frame": _time_median(locate, len(held) - frames + 1) / frames,
         "cost/frame_bytes": float(math.prod(module.reduced_shape) * held.element_size()),
@@ -90,7 +91,9 @@ def _time_median(work: Callable[[int], object], count: int, most: int = 30) -> f
     with torch.inference_mode():
         work(0)
         for i in range(min(count, most)):
+            wait_for_device()
             start = time.perf_counter()
             work(i)
+            wait_for_device()
             times.append((time.perf_counter() - start) * 1e3)
     return statistics.median(times)

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import torch
 from lightning import Trainer
 from matplotlib.figure import Figure
+from torch import Tensor
 
 from lightning_pose.data.batches import PoseBatch
 from lightning_pose.data.datamodule import SceneDataModule, scene_datamodule
@@ -19,26 +20,27 @@ from lightning_pose.geometry.quaternions import orientation_error_deg, position_
 from lightning_pose.metrics.catalog import reference_baseline
 from lightning_pose.models.base import Pose, PoseModule
 from lightning_pose.models.landmark_map import LandmarkMap
+from lightning_pose.models.parts.poses import Located
 from lightning_pose.scenes.scene import Scene
 
 __all__ = ["evaluate_images"]
 
 
-def evaluate_images(
-    trainer: Trainer, module: PoseModule, outputs: list[Pose], model: Mapping[str, float]
-) -> Evaluation:
+def evaluate_images(trainer: Trainer, module: PoseModule, located: Located, model: Mapping[str, float]) -> Evaluation:
     """Evaluate a test of single images.
 
     Args:
         trainer: after the test.
         module: the model.
-        outputs: poses of each batch.
+        located: poses of the test frames, or of some of them.
         model: its metrics.
     """
     datamodule = scene_datamodule(trainer)
     scene = datamodule.scene
     train, test = _join_splits(datamodule, module.training_splits), datamodule.dataset("test").data
-    prediction = Pose(*(torch.cat(parts) for parts in zip(*outputs, strict=True)))
+    rows = match_rows(test.frame, located.frame)
+    test = PoseBatch(*(tensor[rows] for tensor in test))
+    prediction = Pose(located.position_m.double(), located.quat_wxyz.float())
     appearance = datamodule.extractor.appearance
     baselines = evaluate_baselines(
         appearance(train.features),
@@ -60,6 +62,12 @@ def evaluate_images(
         trajectories={"truth": (frames, Pose(test.position_m, test.quat_wxyz)), "predictions": (frames, prediction)},
         figures=_draw_image_figures(scene, name, train, test, poses) | on_map.figures,
     )
+
+
+def match_rows(frame: Tensor, wanted: Tensor) -> Tensor:
+    """(M,) rows of `frame` (N,), in any order, that hold each wanted frame (M,)."""
+    order = frame.argsort()
+    return order[torch.searchsorted(frame[order], wanted)]
 
 
 def _join_splits(datamodule: SceneDataModule, splits: tuple[str, ...]) -> PoseBatch:

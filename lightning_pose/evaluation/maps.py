@@ -44,11 +44,12 @@ def evaluate_map(module: LandmarkMap, datamodule: SceneDataModule) -> MapEvaluat
     frames = [scene.frames[i] for i in data.frame.tolist()]
     truth_m = np.array([frame.position_m for frame in frames])
     quats = torch.from_numpy(np.array([frame.quat_wxyz for frame in frames]))
-    found_m = np.array([answer.pose.position for answer in answers])
+    found_m = to_world(module, np.array([answer.pose.position for answer in answers]))
     position = position_error_m(torch.from_numpy(found_m), torch.from_numpy(truth_m)).numpy()
     orientation = orientation_error_deg(torch.from_numpy(stack_quats(answers)), quats).numpy()
     accepted = np.array([answer.accepted for answer in answers])
-    radius_m, radius_deg = module.network.find_radii(answers)
+    radius, radius_deg = module.network.find_radii(answers)
+    radius_m = radius * module.world_frame.scale
     metrics = {"test/accepted": float(accepted.mean())}
     rows: dict[str, Mapping[str, float]] = {}
     if accepted.any():
@@ -65,7 +66,13 @@ def evaluate_map(module: LandmarkMap, datamodule: SceneDataModule) -> MapEvaluat
     about = f"LandmarkMap on {scene.name}"
     figures = {
         "map": map_figures.draw_map(
-            point_map.points, point_map.given_position, truth_m, found_m, accepted, title=about, unit=scene.unit
+            to_world(module, point_map.points),
+            to_world(module, point_map.given_position),
+            truth_m,
+            found_m,
+            accepted,
+            title=about,
+            unit=scene.unit,
         ),
         "error_vs_inliers": map_figures.draw_error_vs_inliers(
             position, np.array([answer.inliers for answer in answers]), accepted, title=about, unit=scene.unit
@@ -79,6 +86,11 @@ def evaluate_map(module: LandmarkMap, datamodule: SceneDataModule) -> MapEvaluat
             unit=scene.unit,
         )
     return MapEvaluation(metrics, rows, figures)
+
+
+def to_world(module: LandmarkMap, position: np.ndarray) -> np.ndarray:
+    """(N, 3) positions of the map in the world."""
+    return module.world_frame.to_world(torch.from_numpy(position)).numpy()
 
 
 def stack_quats(answers: list[MapAnswer]) -> np.ndarray:

@@ -30,6 +30,7 @@ class FeatureExtractor(ABC):
     - `color`: whether `extract` takes `gray` (H, W) or `rgb` (H, W, 3) uint8 images;
     - `primary`: the name of the array that the networks read;
     - `settings`: everything that changes the stored arrays, in plain types (it keys the cache);
+    - `version`: of the computation, raised by one when the same settings give other arrays (it keys the cache too);
     - `feature_shape`: the shape that `features` returns for one image, and `dtype` if it is not float32;
     - `extract`: the computation, deterministic, for images that may differ in size;
     - `features`: only where the networks do not read the stored primary array as it is.
@@ -40,6 +41,7 @@ class FeatureExtractor(ABC):
     color: ClassVar[Literal["gray", "rgb"]]
     primary: ClassVar[str]
     dtype: ClassVar[type[np.generic]] = np.float32
+    version: ClassVar[int] = 1
 
     @property
     def name(self) -> str:

@@ -46,7 +46,7 @@ class FillReport:
 class FeatureCache:
     """An extractor's records on disk, one safetensors file per image, found by the image's content.
 
-    A file is keyed by the bytes of its image and by the extractor's name and settings:
+    A file is keyed by the bytes of its image and by the extractor's name, version and settings:
     `<root>/<name>-<settings>/<ab>/<content>.safetensors`; `settings.json` has the settings in full. A moved or
     renamed dataset is therefore still cached, and different settings have different folders. A process that is
     killed leaves no partial file; each file has a checksum, and a damaged file is written anew. Several processes may
@@ -64,7 +64,12 @@ class FeatureCache:
     def __init__(self, extractor: FeatureExtractor, root: ImagePath | None = None) -> None:
         self.extractor = extractor
         self.root = Path(root).expanduser() if root else cache_folder("features")
-        self._about = {"format": _FORMAT, "name": extractor.name, "settings": dict(extractor.settings)}
+        self._about = {
+            "format": _FORMAT,
+            "name": extractor.name,
+            "version": extractor.version,
+            "settings": dict(extractor.settings),
+        }
         canonical = json.dumps(self._about, sort_keys=True, separators=(",", ":"))
         self.folder = self.root / f"{extractor.name}-{hash_bytes(canonical.encode(), 8)}"
 
@@ -87,13 +92,25 @@ class FeatureCache:
         """The features that networks read, (len(paths), *extractor.feature_shape) of `extractor.dtype`.
 
         What the cache lacks is extracted first; arguments and errors are those of `fill`.
+
+        Raises:
+            ImageError: also where features are not finite numbers.
         """
         rows = np.empty((len(paths), *self.extractor.feature_shape), self.extractor.dtype)
+        bad: list[int] = []
 
         def put(numbers: list[int], record: Record) -> None:
-            rows[numbers] = self.extractor.features(record)
+            rows[numbers] = features = self.extractor.features(record)
+            if not np.isfinite(features).all():
+                bad.extend(numbers)
 
         self._visit(paths, put, workers, progress)
+        if bad:
+            named = ", ".join(str(paths[number]) for number in sorted(bad)[:3]) + (", ..." if len(bad) > 3 else "")
+            raise ImageError(
+                f"{len(bad)} of {len(paths)} images have {self.extractor.name} features that are not finite numbers: "
+                f"{named}; check the extractor's weights, or leave these images out"
+            )
         return rows
 
     def records(

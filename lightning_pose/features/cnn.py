@@ -83,7 +83,10 @@ class CNN(FeatureExtractor):
 
     @cached_property
     def settings(self) -> Mapping[str, str | int | float | bool | None]:
-        """The arguments; weights of the user's own are replaced by a digest, so that a moved file is still cached."""
+        """The arguments; weights of the user's own are replaced by a digest, so that a moved file is still cached.
+
+        The precision is added, because a GPU computes in half precision, and its features differ from a CPU's.
+        """
         if self.backbone not in BACKBONES:
             weights = _hash_weights(self._network)
         elif Path(self.weights).is_file():
@@ -96,6 +99,7 @@ class CNN(FeatureExtractor):
             "output": self.output,
             "size": self._side,
             "crop": self.crop,
+            "precision": "float16" if _choose_device().type == "cuda" else "float32",
         }
 
     @cached_property

@@ -124,6 +124,7 @@ CURVES = {
 
 COSTS = {
     "parameters": Metric("parameters", heading="parameters", form=",.0f"),
+    "carried_numbers": Metric("numbers that the checkpoint carries", heading="carried", form=",.0f"),
     "layers": Metric("layers", heading="layers", form=",.0f"),
     "train_seconds": Metric("training time", "s", "train s"),
     "ms_per_frame": Metric("network time per frame", "ms", "ms / frame"),

@@ -4,25 +4,27 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import asdict
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import ClassVar, Literal
 
 import torch
-from lightning import LightningModule
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
 
-from lightning_pose.checkpoint import Spec, class_path, resolve_class_path
 from lightning_pose.data.batches import PoseBatch, PoseDataset
 from lightning_pose.data.datamodule import SceneDataModule, find_datamodule, scene_datamodule
-from lightning_pose.errors import CheckpointError, ConfigError
+from lightning_pose.errors import ConfigError
 from lightning_pose.geometry.quaternions import align_hemisphere, mean_quat, quat_normalize
 from lightning_pose.losses import LossConfig, PoseLoss
+from lightning_pose.metrics.item_means import ItemMeans, key_items, key_poses
 from lightning_pose.metrics.pose_metrics import PoseMetrics
+from lightning_pose.models.parts.checkpoint_hooks import CheckpointHooks
+from lightning_pose.models.parts.divergence import DivergenceWatch
+from lightning_pose.models.parts.poses import Located, Pose, check_features, check_poses
 from lightning_pose.models.parts.scaling import measure_columns, measure_poses
 from lightning_pose.models.parts.schedule import cosine_factor
 from lightning_pose.models.parts.world_frame import WorldFrame
 
-__all__ = ["Pose", "PoseModule"]
+__all__ = ["Located", "Pose", "PoseModule"]
 
 Stage = Literal["train", "val", "test"]
 
@@ -30,14 +32,7 @@ Stage = Literal["train", "val", "test"]
 warnings.filterwarnings("ignore", message=".*overridden `on_before_batch_transfer` in `LightningModule`")
 
 
-class Pose(NamedTuple):
-    """Camera-to-world poses: `position_m` (..., 3) in metres or the scene's unit, `quat_wxyz` (..., 4) unit."""
-
-    position_m: Tensor
-    quat_wxyz: Tensor
-
-
-class PoseModule(LightningModule):
+class PoseModule(CheckpointHooks):
     """Base class of the architectures.
 
     To add one, subclass it in a file of its own, call `super().__init__(**kwargs)` first, and set `input_ranks` and
@@ -125,8 +120,9 @@ class PoseModule(LightningModule):
         self.standardize_features = standardize_features
         self.loss = PoseLoss(loss)
         self.world_frame = WorldFrame(centred=not self.reads_clips)
-        self.val_metrics = PoseMetrics()
-        self.test_metrics = PoseMetrics()
+        self.divergence = DivergenceWatch()
+        self.val_metrics, self.val_losses = PoseMetrics(), ItemMeans()
+        self.test_metrics, self.test_losses = PoseMetrics(), ItemMeans()
         self.register_buffer("pose_mean", torch.zeros(7))
         self.register_buffer("pose_scale", torch.ones(7))
         self.register_buffer("quat_reference", torch.tensor([1.0, 0.0, 0.0, 0.0]))
@@ -149,11 +145,6 @@ class PoseModule(LightningModule):
     def reduced_shape(self) -> tuple[int, ...]:
         """Shape of the numbers that a frame must be stored as for the trained layers; their size is a frame's cost."""
         return self.input_shape
-
-    @property
-    def training_splits(self) -> tuple[str, ...]:
-        """The splits whose poses end up in the weights; the image retrieval baseline searches the same."""
-        return ("train",)
 
     def forward(self, features: Tensor) -> Pose:
         """Features (B, *input_shape) -> poses of B frames in the world, positions in float64."""
@@ -197,6 +188,7 @@ class PoseModule(LightningModule):
             quat_wxyz: (M, 4) of training.
         """
         self.quat_reference.copy_(mean_quat(quat_wxyz))
+        self.divergence.spread_m = float((position - position.mean(0)).norm(dim=-1).mean())
         if self.standardize:
             mean, spread = measure_poses(position, quat_wxyz, self.quat_reference)
             self.pose_mean.copy_(mean)
@@ -233,6 +225,8 @@ class PoseModule(LightningModule):
             self.check_data(datamodule)
         if datamodule is not None and stage == "fit":
             train = datamodule.dataset("train")
+            for split in self.training_splits:
+                check_features(datamodule.dataset(split).data)
             self.fit_world_frame(train)
             position_m, quat_wxyz = self.training_poses(train)
             position = self.world_frame.to_local(position_m)
@@ -258,50 +252,92 @@ class PoseModule(LightningModule):
         batch = self.localize_batch(batch)
         return batch._replace(position_m=batch.position_m.float()) if self.device.type == "mps" else batch
 
-    def _step(self, batch: PoseBatch, stage: Stage) -> tuple[Tensor, Pose]:
-        """Decode a localized batch, compare it with the truth, and log; for training, validation and test.
+    def _compare(self, batch: PoseBatch, by_item: bool) -> tuple[dict[str, Tensor], Tensor, Tensor]:
+        """Decode a localized batch.
 
         Returns:
-            the loss, and the poses in the world.
+            its loss's terms, local positions (B, ..., 3) and quaternions (B, ..., 4), not yet normalised.
         """
         position, quat_raw = self.decode_batch(batch)
         target = align_hemisphere(batch.quat_wxyz, self.quat_reference)
-        terms = self.loss(position, quat_raw, batch.position_m.to(position.dtype), target)
-        names = {f"{stage}/loss" if name == "total" else f"{stage}/loss_{name}": t for name, t in terms.items()}
-        self.log_dict(names, on_step=False, on_epoch=True, batch_size=len(batch.frame))
+        truth = batch.position_m.to(position.dtype)
+        return self.loss(position, quat_raw, truth, target, by_item), position, quat_raw
+
+    def _train_step(self, batch: PoseBatch) -> Tensor:
+        """The loss of a training batch, with its terms logged."""
+        terms, position, _ = self._compare(batch, by_item=False)
+        named = {_name_loss("train", name): term for name, term in terms.items()}
+        self.log_dict(named, on_step=False, on_epoch=True, batch_size=len(batch.frame), sync_dist=True)
+        self.divergence.add_step(terms["total"], position, batch.position_m)
+        return terms["total"]
+
+    def _judge_step(self, batch: PoseBatch, metrics: PoseMetrics, losses: ItemMeans) -> Pose:
+        """The poses, in the world, of a batch of validation or test, with their errors and losses collected."""
+        terms, position, quat_raw = self._compare(batch, by_item=True)
         to_world = self.world_frame.to_world
-        pose = Pose(to_world(position.detach()), quat_normalize(quat_raw.detach()))
-        if stage != "train":
-            metrics = self.val_metrics if stage == "val" else self.test_metrics
-            truth = Pose(to_world(batch.position_m), batch.quat_wxyz)
-            metrics.update(*self.select_judged(pose), *self.select_judged(truth))
-        return terms["total"], pose
+        pose = Pose(to_world(position), quat_normalize(quat_raw))
+        check_poses(Located(batch.frame, *pose), type(self).__name__, self._remedy)
+        losses.update(terms, key_items(batch.frame))
+        keys = key_poses(batch.frame)
+        # As poses with one column, because the judged part is cut from them likewise.
+        judged = self.select_judged(Pose(keys.unsqueeze(-1), keys.unsqueeze(-1))).position_m.squeeze(-1)
+        truth = self.select_judged(Pose(to_world(batch.position_m), batch.quat_wxyz))
+        metrics.update(*self.select_judged(pose), *truth, judged)
+        return pose
+
+    @property
+    def _remedy(self) -> str:
+        """What a user can do whose training diverged."""
+        return f"lower model.learning_rate ({self.learning_rate:g}), or set trainer.gradient_clip_val, such as 1"
 
     def select_judged(self, pose: Pose) -> Pose:
         """The part of a batch's poses that metrics count; all of them, unless some are known beforehand."""
         return pose
 
-    def training_step(self, batch: PoseBatch, batch_idx: int) -> Tensor:
-        return self._step(batch, "train")[0]
+    def training_step(self, batch: PoseBatch, batch_idx: int) -> Tensor | None:
+        return self._train_step(batch)
 
     def validation_step(self, batch: PoseBatch, batch_idx: int) -> None:
-        self._step(batch, "val")
+        self._judge_step(batch, self.val_metrics, self.val_losses)
 
-    def test_step(self, batch: PoseBatch, batch_idx: int) -> Pose:
-        return self._step(batch, "test")[1]
+    def test_step(self, batch: PoseBatch, batch_idx: int) -> Located:
+        return Located(batch.frame, *self._judge_step(batch, self.test_metrics, self.test_losses))
 
-    def predict_step(self, batch: PoseBatch, batch_idx: int) -> Pose:
-        return self(batch.features)
+    def predict_step(self, batch: PoseBatch, batch_idx: int) -> Located:
+        pose = self(batch.features)
+        check_poses(Located(batch.frame, *pose), type(self).__name__, self._remedy)
+        return Located(batch.frame, *pose)
 
     def on_validation_epoch_end(self) -> None:
-        self._log_metrics(self.val_metrics, "val")
+        self._log_metrics(self.val_metrics, self.val_losses, "val")
 
     def on_test_epoch_end(self) -> None:
-        self._log_metrics(self.test_metrics, "test")
+        self._log_metrics(self.test_metrics, self.test_losses, "test")
 
-    def _log_metrics(self, metrics: PoseMetrics, stage: Stage) -> None:
-        self.log_dict({f"{stage}/{name}": value for name, value in metrics.compute().items()})
+    def on_train_epoch_end(self) -> None:
+        """Refuse to go on, and to write a checkpoint, once training has diverged.
+
+        Raises:
+            ConfigError: it has.
+        """
+        self.divergence.check_epoch(self._remedy)
+        self.divergence.check_weights(self.parameters(), self._remedy)
+
+    def _log_metrics(self, metrics: PoseMetrics, losses: ItemMeans, stage: Stage) -> None:
+        """Log the means over all processes, each item once.
+
+        Raises:
+            ConfigError: training has diverged.
+        """
+        errors = metrics.compute()
+        if not self.trainer.sanity_checking:
+            self.divergence.check_epoch(self._remedy)  # before this epoch's checkpoint is written
+            self.divergence.check_error(errors["position_median_m"], self._remedy)
+        named = {_name_loss(stage, name): value for name, value in losses.compute().items()}
+        # Every process has the same values, which `sync_dist` leaves as they are; without it Lightning warns.
+        self.log_dict(named | {f"{stage}/{name}": value for name, value in errors.items()}, sync_dist=True)
         metrics.reset()
+        losses.reset()
 
     def configure_optimizers(self) -> torch.optim.Optimizer | OptimizerLRSchedulerConfig:
         # Foreach kernels: one launch for all tensors, which matters for networks as small as these.
@@ -314,35 +350,7 @@ class PoseModule(LightningModule):
         scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: cosine_factor(step, steps))
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
-    def describe(self) -> Spec:
-        """Plain settings that rebuild this module; checkpoints carry them."""
-        return {"class_path": class_path(self), "init_args": dict(self.hparams)}
 
-    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuse a checkpoint that does not suit this module, before any weight is loaded.
-
-        Raises:
-            CheckpointError: it is of another architecture, or its tensors have other shapes.
-        """
-        saved = checkpoint.get("lightning_pose", {}).get("model", {}).get("class_path", class_path(self))
-        saved = resolve_class_path(saved)
-        if saved != class_path(self):
-            raise CheckpointError(
-                f"the checkpoint holds a {saved.rpartition('.')[2]}, not a {type(self).__name__}; "
-                "give the config it was trained with"
-            )
-        own = self.state_dict()
-        for name, value in checkpoint["state_dict"].items():
-            if name in own and own[name].shape != value.shape:
-                raise CheckpointError(
-                    f"{name} has shape {tuple(value.shape)} in the checkpoint and {tuple(own[name].shape)} here; "
-                    "give the settings it was trained with, data.extractor included"
-                )
-
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add the specs of the module and its data, from which `Localizer` rebuilds both."""
-        datamodule = find_datamodule(self.trainer)
-        checkpoint["lightning_pose"] = {
-            "model": self.describe(),
-            "data": datamodule.describe() if datamodule is not None else None,
-        }
+def _name_loss(stage: Stage, term: str) -> str:
+    """The name in MLflow of a term of the loss."""
+    return f"{stage}/loss" if term == "total" else f"{stage}/loss_{term}"

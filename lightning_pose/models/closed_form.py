@@ -111,9 +111,10 @@ class ClosedFormModule(PoseModule):
                 self.moments.add(*self._regression_terms(batch))
             self.network.set_solution(self.moments.ridge([self._lambda], self.components)[0])
         for batch in self._batches("train"):
-            self._step(batch, "train")
+            self._train_step(batch)
         self.log("train/lambda", self._lambda)
         del self.moments
+        super().on_train_epoch_end()
         self.trainer.should_stop = True  # further epochs would find the same
 
     def add_frames(self, batch: PoseBatch, frames: int) -> None:

@@ -107,7 +107,9 @@ class LandmarkMap(TrainingMemory, PoseModule):
             self._build(("train", "val"), calibrate=True)
         train = datamodule.dataset("train")
         sample = list(range(0, len(train), max(1, len(train) // 50)))
-        self._step(PoseBatch(*(part.to(self.device) for part in train.__getitems__(sample))), "train")
+        batch = self.localize_batch(train.__getitems__(sample))
+        self._train_step(PoseBatch(*(part.to(self.device) for part in batch)))
+        super().on_train_epoch_end()
         self.trainer.should_stop = True  # further epochs would find the same
 
     @property
@@ -142,7 +144,7 @@ class LandmarkMap(TrainingMemory, PoseModule):
                 len(point_map),
                 point_map.n_bytes / 1e6,
                 "on" if self._adjusts else "off",
-                calibration.position_error,
+                calibration.position_error * self.world_frame.scale,
                 datamodule.scene.unit,
                 calibration.orientation_error_deg,
             )
@@ -177,7 +179,7 @@ class LandmarkMap(TrainingMemory, PoseModule):
             torch.cat([part.features for part in data])[order],
             camera,
             Rotation.from_quat(quats, scalar_first=True).as_matrix(),
-            np.array([frame.position_m for frame in frames]),
+            self.world_frame.to_local(torch.from_numpy(np.array([frame.position_m for frame in frames]))).numpy(),
         )
 
     def _find_camera(self, datamodule: SceneDataModule) -> Camera:

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from lightning import LightningModule, Trainer
-from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.callbacks import ModelCheckpoint, Timer
 from torch import Tensor
+from torch.utils.data import DataLoader
 
+from lightning_pose.data.batches import PoseBatch
 from lightning_pose.data.datamodule import find_datamodule
+from lightning_pose.runs.callbacks import find_callback
 from lightning_pose.runs.checkpoint_files import use_checkpoint_files
 from lightning_pose.runs.logger import MLflowLogger
+from lightning_pose.runs.random_state import RandomState, collect_random_states, restore_random_state
+from lightning_pose.runs.resume import read_seed
 
 __all__ = ["BestCheckpoint", "LastCheckpoint", "checkpoint_folder", "run_logger"]
 
@@ -35,6 +41,16 @@ class _RunCheckpoint(ModelCheckpoint):
         if stage == "fit":
             self.dirpath = str(checkpoint_folder(trainer))
         super().setup(trainer, pl_module, stage)
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore the best score of the same run; its folder may have moved."""
+        if self._is_same_run(state_dict):
+            state_dict = {**state_dict, "dirpath": self.dirpath}
+        super().load_state_dict(state_dict)
+
+    def _is_same_run(self, state_dict: dict[str, Any]) -> bool:
+        """Whether a state is of the run that goes on, and not of one that another run begins with."""
+        return Path(state_dict["dirpath"] or "").name == Path(self.dirpath or "").name
 
 
 class BestCheckpoint(_RunCheckpoint):
@@ -72,7 +88,7 @@ class BestCheckpoint(_RunCheckpoint):
             measured = trainer.callback_metrics.items()
             self._metrics = {f"best/{name}": float(v) for name, v in measured if name.startswith("val/")}
 
-    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._log_best(trainer)
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
@@ -84,10 +100,57 @@ class BestCheckpoint(_RunCheckpoint):
         if logger is not None and self._metrics:
             logger.log_metrics(self._metrics)
 
+    def state_dict(self) -> dict[str, Any]:
+        return {**super().state_dict(), "metrics": self._metrics}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        super().load_state_dict(state_dict)
+        if self._is_same_run(state_dict):
+            self._metrics = state_dict.get("metrics", {})
+
 
 class LastCheckpoint(_RunCheckpoint):
-    """`last.ckpt`: everything that training needs to resume, written after every epoch."""
+    """`last.ckpt`: everything that training needs to resume, written after every epoch.
+
+    A run that goes on from it draws the same random numbers as one that was not stopped.
+
+    Attributes:
+        finishes: a run that had stopped training early, and was stopped before the end of its test, trains no more.
+    """
 
     def __init__(self) -> None:
         # On the end of the training epoch, so that it is written with and without validation frames.
         super().__init__(filename="last", enable_version_counter=False, save_on_train_epoch_end=True)
+        self.finishes = False
+        self._stopped = False
+        self._settings: dict[str, object] = {}
+        self._random_states: list[RandomState] | None = None
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        timer = find_callback(trainer, Timer)
+        # A run that ran out of time may go on with more of it.
+        self._stopped = trainer.should_stop and not (timer is not None and (timer.time_remaining() or 1) <= 0)
+        self._settings = {"seed_everything": read_seed(), "trainer.precision": str(trainer.precision)}
+        super().on_train_epoch_end(trainer, pl_module)
+
+    def state_dict(self) -> dict[str, Any]:
+        own = {"stopped": self._stopped, "settings": self._settings, "random_states": collect_random_states()}
+        return {**super().state_dict(), **own}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        super().load_state_dict(state_dict)
+        self._stopped = state_dict.get("stopped", False)
+        self._random_states = state_dict.get("random_states")
+
+    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if self.finishes and self._stopped:
+            trainer.should_stop = True
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if self._random_states is not None:
+            restore_random_state(self._random_states)
+            # In a run that goes on without a stop, each further epoch begins with a new iterator, which draws a number.
+            loader: DataLoader[PoseBatch] | None = trainer.train_dataloader
+            assert loader is not None, "training has begun"
+            iter(loader)
+            self._random_states = None

@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import subprocess
 
 from lightning import LightningModule, Trainer
-from lightning.pytorch.callbacks import Callback, Timer
+from lightning.pytorch.callbacks import Callback, EarlyStopping
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from lightning_pose.data.datamodule import SceneDataModule, scene_datamodule
 from lightning_pose.errors import ImageError
 from lightning_pose.models.base import PoseModule
+from lightning_pose.runs.callbacks import find_callback
 from lightning_pose.runs.checkpoints import checkpoint_folder, run_logger
-from lightning_pose.runs.logger import MLflowLogger
+from lightning_pose.runs.logger import MLflowLogger, flatten_settings
+from lightning_pose.runs.resume import read_seed
 from lightning_pose.runs.tags import OPERATIONAL
 from lightning_pose.scenes.images import read_gray
 
-__all__ = ["RunRecorder", "read_train_seconds"]
+__all__ = ["RunRecorder"]
 
 
 class RunRecorder(Callback):
@@ -31,8 +32,11 @@ class RunRecorder(Callback):
 
     config_yaml: str | None = None
     keeps_checkpoints: bool = True
+    _patience: int | None = None
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        stopping = find_callback(trainer, EarlyStopping)
+        self._patience = None if stopping is None else stopping.patience
         logger = run_logger(trainer)
         if logger is None:
             return
@@ -43,7 +47,12 @@ class RunRecorder(Callback):
             return  # the test that follows fit belongs to the same run
         for name, value in self._collect_tags(trainer, pl_module, stage).items():
             logger.client.set_tag(run_id, name, value)
-        logger.log_hyperparams(_collect_settings(trainer, pl_module))
+        settings = _collect_settings(trainer, pl_module)
+        known = logger.client.get_run(run_id).data.params
+        for name, value in flatten_settings(settings).items():
+            if name in known and known[name] != str(value):  # MLflow keeps a parameter as it is
+                logger.client.set_tag(run_id, name, str(value))
+        logger.log_hyperparams(settings)
         if self.config_yaml is not None:
             logger.client.log_text(run_id, self.config_yaml, "config.yaml")
 
@@ -52,7 +61,7 @@ class RunRecorder(Callback):
         kept = logger.client.get_run(str(logger.run_id)).data
         if kept.params:
             return None
-        scene, seed = scene_datamodule(trainer).scene.name, _read_seed()
+        scene, seed = scene_datamodule(trainer).scene.name, read_seed()
         trial = kept.tags.get("sweep.trial")
         parts = (
             f"{type(module).__name__} {scene} {module.headline}",
@@ -87,17 +96,16 @@ class RunRecorder(Callback):
         if logger is not None and isinstance(exception, KeyboardInterrupt | SIGTERMException):
             logger.stopped_as = "KILLED"
 
+    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        stopping = find_callback(trainer, EarlyStopping)
+        if stopping is not None and self._patience is not None:
+            stopping.patience = self._patience  # the checkpoint has set it to what it was
+
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         logger = run_logger(trainer)
         if logger is not None and self.keeps_checkpoints:
             for file in sorted(checkpoint_folder(trainer).glob("*.ckpt")):
                 logger.client.log_artifact(str(logger.run_id), str(file), "checkpoints")
-
-
-def read_train_seconds(trainer: Trainer) -> float | None:
-    """Seconds spent in training, resumed parts included; None where nothing was trained."""
-    timers = [callback for callback in trainer.callbacks if isinstance(callback, Timer)]  # type: ignore[attr-defined]
-    return (timers[0].time_elapsed("train") or None) if timers else None
 
 
 def _collect_settings(trainer: Trainer, module: PoseModule) -> dict[str, object]:
@@ -113,7 +121,7 @@ def _collect_settings(trainer: Trainer, module: PoseModule) -> dict[str, object]
         "model": module.describe()["init_args"],
         "data": data | {"init_args": kept},
         "trainer": {"max_epochs": trainer.max_epochs, "precision": trainer.precision},
-        "seed": _read_seed(),
+        "seed": read_seed(),
     }
 
 
@@ -130,12 +138,6 @@ def _test_tags(datamodule: SceneDataModule, module: PoseModule) -> dict[str, str
             height, width = read_gray(scene.frames[test[0]].image).shape
             tags["image_size"] = f"{width}x{height}"
     return tags
-
-
-def _read_seed() -> int | None:
-    """The seed that Lightning has set for this process."""
-    seed = os.environ.get("PL_GLOBAL_SEED")
-    return int(seed) if seed else None
 
 
 def _read_git_commit() -> str | None:

@@ -13,7 +13,7 @@ from lightning import Trainer
 from torch import Tensor
 
 from lightning_pose.evaluation.costs import costs
-from lightning_pose.models import Pose, PoseModule
+from lightning_pose.models import KernelPoseNet, Pose, PoseModule
 from tests.models.helpers import LearnableProblem
 
 
@@ -41,6 +41,22 @@ def test_the_first_call_is_not_measured(monkeypatch: pytest.MonkeyPatch, tmp_pat
     trainer.datamodule = problem  # type: ignore[attr-defined]
     model = SlowAtFirst(clock)
     monkeypatch.setattr(time, "perf_counter", lambda: clock.seconds)
+    waits: list[float] = []
+    monkeypatch.setattr(torch.accelerator, "is_available", lambda: True)
+    monkeypatch.setattr(torch.accelerator, "synchronize", lambda: waits.append(clock.seconds))
     found = costs(trainer, model, features=False)
     assert found["cost/ms_per_frame"] == pytest.approx(2.0)
     assert model.calls == 3
+    assert waits == pytest.approx([1.0, 1.002, 1.002, 1.004]), "a GPU's work is waited for on both sides"
+
+
+def test_trained_and_carried_numbers(tmp_path: Path) -> None:
+    problem = LearnableProblem([4], count=6)
+    trainer = Trainer(accelerator="cpu", logger=False, enable_checkpointing=False, default_root_dir=tmp_path)
+    trainer.datamodule = problem  # type: ignore[attr-defined]
+    model = KernelPoseNet(input_shape=[4])
+    model.network.set_landmarks(problem.dataset("train").data.features, gamma=0.2)
+    found = costs(trainer, model, features=False)
+    assert found["cost/parameters"] == 6 * 7
+    # landmarks, scale and bias; scales of poses and features, and the hemisphere of quaternions
+    assert found["cost/carried_numbers"] == 6 * 7 + 6 * 4 + 1 + 7 + 7 + 7 + 4 + 4 + 4

@@ -116,6 +116,37 @@ def test_settings_have_their_own_folder(tmp_path: Path) -> None:
     assert about["settings"] == {"scale": 2.0}
 
 
+class NewColorMeans(ColorMeans):
+    """The same extractor after its computation has changed."""
+
+    version = 2
+    name = "colormeans"  # pyright: ignore[reportAssignmentType]
+
+
+def test_versions_have_their_own_folder(tmp_path: Path) -> None:
+    old, new = (FeatureCache(extractor, tmp_path) for extractor in (ColorMeans(), NewColorMeans()))
+    assert old.folder != new.folder
+
+
+class Broken(ColorMeans):
+    """An extractor whose network returns no numbers for images 1 and 3."""
+
+    def extract(self, images: Sequence[np.ndarray]) -> list[Record]:
+        records = super().extract(images)
+        for record in records:
+            if record["means"][0] in (1, 3):
+                record["means"] = record["means"] * np.float32(np.nan)
+        return records
+
+
+def test_features_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
+    paths = write_images(tmp_path / "images", 4)
+    cache = FeatureCache(Broken(), tmp_path / "cache")
+    with pytest.raises(ImageError, match=f"2 of 4 images.*{paths[1].name}.*{paths[3].name}"):
+        cache.features(paths, progress=False)
+    assert np.isfinite(cache.features([paths[0], paths[2]], progress=False)).all()
+
+
 def test_fewer_features_are_a_prefix_and_nothing_is_extracted(tmp_path: Path) -> None:
     path = tmp_path / "noise.png"
     cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 256, (160, 200), np.uint8))

@@ -246,6 +246,12 @@ def test_settings_key_the_cache(tmp_path: Path) -> None:
     assert CNN().settings == CNN(size=224).settings
 
 
+def test_half_precision_on_a_gpu_keys_the_cache(monkeypatch: pytest.MonkeyPatch) -> None:
+    on_cpu = CNN(weights="none").settings
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    assert CNN(weights="none").settings != on_cpu
+
+
 def test_settings_hold_a_digest_of_a_weights_file(tmp_path: Path) -> None:
     files = [tmp_path / name for name in ("a.pth", "moved.pth", "other.pth")]
     for file, content in zip(files, (b"same", b"same", b"else"), strict=True):

@@ -71,7 +71,9 @@ def test_every_parameter_gets_a_finite_gradient(architecture: Architecture, monk
     frames = frames_of(model, 8)
     position_m, quat_wxyz = (pose.unflatten(0, frames) for pose in random_poses(math.prod(frames)))
     batch = PoseBatch(features_for(model, 8), position_m, quat_wxyz, torch.arange(8))
-    model.training_step(batch, 0).backward()
+    loss = model.training_step(batch, 0)
+    assert loss is not None
+    loss.backward()
     for name, parameter in model.named_parameters():
         assert parameter.grad is not None, name
         assert parameter.grad.isfinite().all(), name

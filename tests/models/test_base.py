@@ -62,7 +62,9 @@ def test_signs_of_quaternions_do_not_matter(monkeypatch: pytest.MonkeyPatch) -> 
         model = tiny()
         monkeypatch.setattr(model, "log_dict", lambda *args, **kwargs: None)
         model.fit_scale(position_m, quats)
-        losses.append(model.training_step(PoseBatch(features, position_m, quats, torch.arange(16)), 0).item())
+        loss = model.training_step(PoseBatch(features, position_m, quats, torch.arange(16)), 0)
+        assert loss is not None
+        losses.append(loss.item())
     assert losses[1] == pytest.approx(losses[0], rel=1e-5)
 
 

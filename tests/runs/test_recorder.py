@@ -13,8 +13,9 @@ from lightning import Trainer
 from lightning_pose.data import ImageDataModule
 from lightning_pose.models import SurfLSTM
 from lightning_pose.runs.checkpoints import BestCheckpoint, LastCheckpoint, checkpoint_folder
+from lightning_pose.runs.clock import read_train_seconds
 from lightning_pose.runs.logger import MLflowLogger
-from lightning_pose.runs.recorder import RunRecorder, read_train_seconds
+from lightning_pose.runs.recorder import RunRecorder
 from tests.helpers import REPOSITORY, Thumbnails, Trained, Workplace
 
 

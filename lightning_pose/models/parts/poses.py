@@ -1,0 +1,62 @@
+"""Pose and Located, what architectures return, and checks that their input and output are finite numbers."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lightning_pose.data.batches import PoseBatch
+from lightning_pose.errors import DataError
+
+__all__ = ["Located", "Pose", "check_features", "check_poses"]
+
+
+class Pose(NamedTuple):
+    """Camera-to-world poses: `position_m` (..., 3) in metres, `quat_wxyz` (..., 4) unit."""
+
+    position_m: Tensor
+    quat_wxyz: Tensor
+
+
+class Located(NamedTuple):
+    """Poses of a batch and which frames they are of.
+
+    Attributes:
+        frame: (B,) or (B, T) int64, index of each frame in `Scene.frames`.
+        position_m: (B, ..., 3).
+        quat_wxyz: (B, ..., 4), unit.
+    """
+
+    frame: Tensor
+    position_m: Tensor
+    quat_wxyz: Tensor
+
+
+def check_features(data: PoseBatch) -> None:
+    """Raise DataError if features of some frames are not finite numbers."""
+    bad = [int(i) for i, row in zip(data.frame, data.features, strict=True) if not bool(row.isfinite().all())]
+    if bad:
+        raise DataError(
+            f"{len(bad)} of {len(data.frame)} training frames have features that are not finite numbers, the first is "
+            f"frame {bad[0]} of the scene; check the extractor, or leave these frames out"
+        )
+
+
+def check_poses(located: Located, system: str, remedy: str) -> None:
+    """Raise DataError if some poses are not finite numbers.
+
+    Args:
+        located: poses and their frames.
+        system: what returned them.
+        remedy: what the user can do, the end of the error's message.
+    """
+    count = len(located.frame)
+    finite = torch.cat([part.reshape(count, -1) for part in located[1:]], dim=1).isfinite().all(1)
+    if not finite.all():
+        first = int(located.frame[~finite].flatten()[0])
+        raise DataError(
+            f"{system} returns poses that are not finite numbers, {count - int(finite.sum())} of {count}, the first "
+            f"at frame {first} of the scene; {remedy}"
+        )

@@ -1,0 +1,47 @@
+"""When training counts as diverged, and when a rough start does not."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from lightning_pose.errors import ConfigError
+from lightning_pose.models.parts.divergence import DivergenceWatch
+
+
+def watch_steps(*errors: float, loss: float = 1.0) -> DivergenceWatch:
+    watch = DivergenceWatch()
+    watch.spread_m = 1.0
+    for error in errors:
+        watch.add_step(torch.tensor(loss), torch.tensor([[error, 0.0, 0.0]]), torch.zeros(1, 3))
+    return watch
+
+
+def test_a_rough_start_goes_on() -> None:
+    watch = watch_steps(500.0, 3000.0, 1.0)  # far from the origin, without standardization
+    watch.check_epoch("")
+    watch.check_weights([torch.zeros(3)], "")
+
+
+@pytest.mark.parametrize("errors", [(1.0, 1e6), (1.0, float("nan")), (float("nan"),)])
+def test_errors_that_explode(errors: tuple[float, ...]) -> None:
+    with pytest.raises(ConfigError, match=r"training has diverged.*lower it"):
+        watch_steps(*errors).check_epoch("lower it")
+
+
+@pytest.mark.parametrize("loss", [float("nan"), float("inf")])
+def test_a_loss_that_is_no_number(loss: float) -> None:
+    with pytest.raises(ConfigError, match=f"the loss is {loss}"):
+        watch_steps(1.0, loss=loss).check_epoch("")
+
+
+def test_weights_that_are_no_numbers() -> None:
+    with pytest.raises(ConfigError, match="weights are not finite"):
+        watch_steps(1.0).check_weights([torch.zeros(2), torch.tensor([0.0, torch.inf])], "")
+
+
+def test_frames_at_one_place() -> None:
+    watch = DivergenceWatch()
+    watch.add_step(torch.tensor(0.0), torch.zeros(1, 3), torch.zeros(1, 3))
+    watch.add_step(torch.tensor(0.0), torch.full((1, 3), 1e-4), torch.zeros(1, 3))
+    watch.check_epoch("")

@@ -1,0 +1,120 @@
+"""A run that goes on is the run that was not stopped, with the settings that it began with."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+
+import pytest
+import torch
+from lightning import Trainer
+from mlflow.entities import Run
+
+from tests.helpers import FailAt, Workplace
+
+LIVELY = ["--trainer.max_epochs", "5", "--model.dropout", "0.3", "--model.layers", "2"]
+"""Shuffled batches and dropout: each epoch draws random numbers."""
+
+
+class FailInTest(FailAt):
+    """Breaks in the test that follows training."""
+
+    def on_train_batch_end(self, trainer: Trainer, *args: object, **kwargs: object) -> None:
+        """Training goes well."""
+
+    def on_test_start(self, trainer: Trainer, *args: object, **kwargs: object) -> None:
+        self.stop()
+
+
+def stop_at(callback: str, epoch: int) -> list[str]:
+    return ["--trainer.callbacks+", callback, "--trainer.callbacks.epoch", str(epoch)]
+
+
+def stop_run(workplace: Workplace, *args: str) -> Run:
+    with contextlib.suppress(RuntimeError):
+        workplace.run("fit", *args)
+    (run,) = workplace.runs()
+    assert run.info.status == "FAILED"
+    return run
+
+
+def read_weights(workplace: Workplace) -> dict[str, torch.Tensor]:
+    (run,) = workplace.runs()
+    return torch.load(workplace.checkpoint(run, "last"), weights_only=True)["state_dict"]
+
+
+@pytest.mark.parametrize("schedule", ["constant", "cosine"])
+def test_a_resumed_run_is_the_uninterrupted_one(
+    schedule: str, workplace: Workplace, store: Path, tmp_path: Path
+) -> None:
+    settings = [*LIVELY, "--model.schedule", schedule]
+    stop_run(workplace, *settings, *stop_at("tests.helpers.FailAt", 3))
+    assert workplace.run("fit", *settings, "--ckpt_path", "last") == 0
+    whole = Workplace.make(tmp_path / "whole", workplace.scene, store)
+    assert whole.run("fit", *settings) == 0
+    expected = read_weights(whole)
+    assert all(torch.equal(value, expected[name]) for name, value in read_weights(workplace).items())
+    (resumed,), (run,) = workplace.runs(), whole.runs()
+    for name, value in run.data.metrics.items():
+        if not name.startswith("cost/"):
+            assert resumed.data.metrics[name] == pytest.approx(value, rel=1e-6), name
+
+
+def test_the_best_epoch_before_the_stop_is_kept(workplace: Workplace) -> None:
+    # So high a rate makes a later epoch worse than an early one.
+    settings = ["--trainer.max_epochs", "4", "--model.learning_rate", "1"]
+    run = stop_run(workplace, *settings, *stop_at("tests.helpers.FailAt", 3))
+    assert workplace.run("fit", *settings, "--ckpt_path", "last") == 0
+    losses = [metric.value for metric in workplace.client.get_metric_history(run.info.run_id, "val/loss")]
+    assert len(losses) == 4
+    assert workplace.runs()[0].data.metrics["best/val/loss"] == pytest.approx(min(losses))
+
+
+@pytest.mark.parametrize("early", [False, True])
+def test_a_run_stopped_after_its_last_epoch_goes_on_to_its_test(early: bool, workplace: Workplace) -> None:
+    settings = ["--trainer.max_epochs", "2"]
+    if early:
+        stopping = ["--trainer.callbacks+", "lightning.pytorch.callbacks.EarlyStopping"]
+        limits = {"monitor": "val/loss", "patience": "0", "min_delta": "1000"}
+        settings = ["--trainer.max_epochs", "50", *stopping]
+        settings += [word for name, value in limits.items() for word in (f"--trainer.callbacks.{name}", value)]
+    run = stop_run(workplace, *settings, *stop_at("tests.runs.test_resume.FailInTest", 0))
+    before = read_weights(workplace)
+    assert "test/position_median_m" not in run.data.metrics
+    assert workplace.run("fit", *settings, "--ckpt_path", "last") == 0
+    (finished,) = workplace.runs()
+    assert finished.info.status == "FINISHED"
+    assert {"test/position_median_m", "best/val/loss", "cost/train_seconds"} <= finished.data.metrics.keys()
+    assert len(workplace.client.get_metric_history(run.info.run_id, "train/loss")) == 2
+    assert all(torch.equal(value, before[name]) for name, value in read_weights(workplace).items())
+
+
+@pytest.mark.parametrize(
+    ("option", "says"),
+    [
+        (["--model.learning_rate", "0.0001"], "model.learning_rate is 0.0001 and was 0.01"),
+        (["--model.weight_decay", "0.5"], "model.weight_decay is 0.5 and was 0.0"),
+        (["--model.standardize", "false"], "model.standardize is False and was True"),
+        (["--model.loss.orientation_weight", "3"], "model.loss.orientation_weight is 3.0 and was 1.0"),
+        (["--data.batch_size", "4"], "data.batch_size is 4.0 and was 8.0"),
+        (["--data.val_fraction", "0.3"], "data.val_fraction is 0.3 and was 0.1"),
+        (["--seed_everything", "5"], "seed_everything is 5 and was 0"),
+        (["--trainer.precision", "64-true"], "trainer.precision is 64-true and was 32-true"),
+    ],
+)
+def test_other_settings_are_refused(
+    option: list[str], says: str, workplace: Workplace, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = stop_run(workplace, *stop_at("tests.helpers.FailAt", 1))
+    assert workplace.run("fit", "--ckpt_path", "last", *option) == 2
+    assert says in capsys.readouterr().err.splitlines()[-1]
+    (same,) = workplace.runs()
+    assert same.data.params == run.data.params
+    assert workplace.run("fit", "--ckpt_path", "last", "--data.eval_batch_size", "3") == 0
+
+
+def test_more_epochs_are_recorded(workplace: Workplace) -> None:
+    assert workplace.run("fit") == 0
+    assert workplace.run("fit", "--ckpt_path", "last", "--trainer.max_epochs", "3") == 0
+    (run,) = workplace.runs()
+    assert run.data.tags["trainer.max_epochs"] == "3"
