@@ -105,3 +105,10 @@ def test_a_study_starts_from_the_form_of_the_thesis(study: Path) -> None:
 def test_node_pose_is_searched_up_to_the_neighbours_of_the_thesis() -> None:
     space = yaml.safe_load((REPOSITORY / "sweeps" / "node_pose.yaml").read_text())["space"]
     assert space["model.neighbours"]["high"] == 40
+
+
+@pytest.mark.parametrize("name", ["cnn_3d", "cnn_rnn"])
+def test_clips_fit_in_the_sequences_of_the_synthetic_room(name: str) -> None:
+    data = yaml.safe_load((REPOSITORY / "configs" / "thesis" / f"{name}.yaml").read_text())["data"]["init_args"]
+    assert data["clip_length"] <= 30, "frames of a sequence"
+    assert data["train_rooms"] != data["test_rooms"], "tested in a room never seen"
