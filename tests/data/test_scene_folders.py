@@ -82,7 +82,11 @@ def test_validation_has_recordings_of_its_own(recordings: list[str]) -> None:
 
 
 def test_clips_have_them_as_well(recordings: list[str]) -> None:
-    named = {"train_scenes": recordings[:1], "val_scenes": recordings[2:], "test_scenes": recordings[1:2]}
+    named: dict[str, Any] = {
+        "train_scenes": recordings[:1],
+        "val_scenes": recordings[2:],
+        "test_scenes": recordings[1:2],
+    }
     data = ClipDataModule(Thumbnails(), clip_length=4, **named)
     assert [len(data.scene.splits[split]) for split in ("train", "val", "test")] == [12, 8, 10]
 
