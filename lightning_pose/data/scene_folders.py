@@ -82,9 +82,9 @@ class SceneFolders:
             learned, asked = ([str(room) for room in part] for part in rooms)
         held_out = 0.0 if validated else self.val_fraction
         asked = learned if asked is None else asked
-        tested = {_resolve(folder) for folder in asked or []}
+        tested = {_resolve_folder(folder) for folder in asked or []}
         read = cache(partial(self._load, val_block=val_block))
-        train = [read(folder, held_out, _resolve(folder) in tested) for folder in learned or []]
+        train = [read(folder, held_out, _resolve_folder(folder) in tested) for folder in learned or []]
         test = [read(folder, held_out, True) for folder in asked or []]
         val = [read(folder, 0.0, False) for folder in validated]
         if one_world:
@@ -101,6 +101,6 @@ class SceneFolders:
         return apply_ground_truth(scene, self.ground_truth, self.pgt)
 
 
-def _resolve(folder: str) -> Path:
+def _resolve_folder(folder: str) -> Path:
     """The folder's one true path, for comparisons."""
     return Path(folder).expanduser().resolve()

@@ -21,7 +21,7 @@ def find_run_starts(scene: Scene) -> np.ndarray:
     """Find the frames that begin a run of consecutive frames: the first of each sequence, and those after a gap.
 
     A gap is a step in number or in time of more than `GAP` times the sequence's median step. Numbers that mostly stay
-    the same tell nothing, and a sequence without timestamps is judged by its numbers alone.
+    the same show nothing, and a sequence without timestamps is judged by its numbers alone.
 
     Returns:
         (F,) bool.
