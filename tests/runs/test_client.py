@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +36,7 @@ class Outage:
 
 
 @pytest.fixture
-def outage(monkeypatch: pytest.MonkeyPatch) -> Iterator[Outage]:
+def outage(monkeypatch: pytest.MonkeyPatch) -> Outage:
     outage = Outage()
     for name in ("log_batch", "log_text", "log_artifact", "log_figure", "set_tag", "set_terminated", "update_run"):
         monkeypatch.setattr(MlflowClient, name, outage.wrap(getattr(MlflowClient, name)))
