@@ -44,7 +44,7 @@ def explain_setting_error(message: str) -> str:
     kinds = [kind for kind in dict.fromkeys(_name_kind(match[1]) for match in EXPECTED.finditer(text)) if kind]
     given = GIVEN.search(text)
     text = " ".join(GIVEN.sub("", EXPECTED.sub("", text)).split()).rstrip(" .;")
-    if kinds and not re.search(r"is not accepted|Problem with|not found|: give ", text):
+    if kinds and re.fullmatch(r"([\w.]+: ?)*", text):  # else a constructor says what is wrong
         text = f"{text} give {' or '.join(kinds)}{f', not {given[1].strip()}' if given else ''}"
     elif given and given[1].strip() not in text:
         text = re.sub(r"^((?:[\w.]+: )*)", lambda keys: f"{keys[1]}{given[1].strip()}: ", text)

@@ -36,6 +36,10 @@ UNION = """Parser key "trainer.logger":
             " a subclass of PoseModule\n - Expected a <class 'NoneType'>\n Given value: a.B",
             "model: a.B: Import path does not correspond to a subclass of PoseModule",
         ),
+        (
+            UNION.replace("- Expected a dot import path string: 5", "- no server there; start it"),
+            "trainer.logger: 5: no server there; start it",
+        ),
         ("data: Option 'root' is not accepted", "data: Option 'root' is not accepted"),
         (
             "the following arguments are required: fit.data, fit.model",
