@@ -164,7 +164,7 @@ def inspect_images(scene: Scene, files: list[ImageFile]) -> Findings:
 
 
 def _describe_kinds(scene: Scene, facts: list[ImageFacts | None]) -> list[str]:
-    """What is to know of images with an EXIF orientation, and of images of less than 16 bits in 16-bit files."""
+    """Texts on images with an EXIF orientation, and of images of less than 16 bits in 16-bit files."""
     known = [(i, fact) for i, fact in enumerate(facts) if fact is not None]
     texts = []
     turned = Counter(f"orientation {fact.orientation}" for _, fact in known if fact.orientation != 1)

@@ -80,10 +80,10 @@ def describe_bad_frames(scene: Scene) -> str:
     """How many of a scene's frames cannot be used, and the first of them."""
     bad = scene.bad_frames
     more = [f"and {len(bad) - NAMED_FRAMES} more"] if len(bad) > NAMED_FRAMES else []
-    named = "; ".join([*map(_shorten, bad[:NAMED_FRAMES]), *more])
+    named = "; ".join([*map(_shorten_fault, bad[:NAMED_FRAMES]), *more])
     return f"{len(bad)} of {len(scene.frames) + len(bad)} frames cannot be used: {named}"
 
 
-def _shorten(text: str) -> str:
+def _shorten_fault(text: str) -> str:
     """A text without its middle if it is too long to read."""
     return text if len(text) <= LONGEST_FAULT else f"{text[: LONGEST_FAULT // 2]}...{text[-LONGEST_FAULT // 2 :]}"

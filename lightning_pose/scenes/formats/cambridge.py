@@ -119,7 +119,7 @@ def _make_frames(root: Path, rows: dict[str, list[PoseRow]]) -> tuple[list[Frame
     numbers = np.array([row.numbers for _, row in listed])
     position_m, quats, found = check_quats(numbers[:, :3], numbers[:, 3:], scalar_first=True)
     quats = Rotation.from_quat(quats, scalar_first=True).inv().as_quat(canonical=True, scalar_first=True)
-    sequences = [_find_sequence(root, image) for image in images]
+    sequences = [_find_image_folder(root, image) for image in images]
     indices = _number_frames(sequences, images)
     read = choose_listed_images(images)
     chosen = [i for i, image in enumerate(images) if image in read]
@@ -151,7 +151,7 @@ def _keep_near_median(root: Path, frames: Sequence[Frame], faults: Sequence[str]
     return kept
 
 
-def _find_sequence(root: Path, image: Path) -> str:
+def _find_image_folder(root: Path, image: Path) -> str:
     """The sequence of an image: its folder under the root, or the root's name."""
     folder = image.parent.relative_to(root).as_posix() if image.is_relative_to(root) else image.parent.as_posix()
     return root.resolve().name if folder == "." else folder

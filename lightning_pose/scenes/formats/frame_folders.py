@@ -68,6 +68,7 @@ def read_frame_folder(folder: Path) -> FrameFolder:
     image_of = choose_images(images)
     _warn_of_suffixes(list(image_of.values()))
     index = sorted(image_of.keys() | poses.keys())
+    _warn_of_holes(folder, index)
     matrices, faults = np.full((len(index), 4, 4), np.nan), []
     for row, number in enumerate(index):
         fault = ""
@@ -104,6 +105,20 @@ def _read_matrix(path: Path) -> np.ndarray:
     if len(numbers) != 16:
         raise ValueError(f"it has {len(numbers)} numbers")
     return numbers.reshape(4, 4)
+
+
+def _warn_of_holes(folder: Path, index: list[int]) -> None:
+    """Log a warning if the numbers of frames jump by more than their usual step."""
+    steps = np.diff(index)
+    holes = np.flatnonzero(steps > np.median(steps)) if len(steps) else steps
+    if len(holes):
+        log.warning(
+            "%s: the numbers of frames jump %d times, first from %d to %d; check that no file is missing",
+            folder,
+            len(holes),
+            index[holes[0]],
+            index[holes[0] + 1],
+        )
 
 
 def _warn_of_suffixes(images: list[Path]) -> None:

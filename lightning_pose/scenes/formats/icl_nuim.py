@@ -36,7 +36,7 @@ class IclNuim(SceneFormat):
 
     The trajectory is `*.gt.freiburg` (`livingRoom2.gt.freiburg`, `traj0.gt.freiburg`), or a
     `groundtruth.txt` that counts 0, 1, 2, ... or 1, 2, 3, ...; its other columns are those of TUM. The images are
-    those of `associations.txt` or `rgb.txt` (of two images in a line, the one whose path says rgb), or of the folder
+    those of `associations.txt` or `rgb.txt` (of two images in a line, the one whose path has rgb), or of the folder
     `rgb`; an image without a pose, as each release has one, is dropped with a warning. Timestamps are N / 30 s.
 
     In the world of the poses y points up, while the images are stored from top to bottom, so the poses are reflected.
@@ -121,7 +121,7 @@ def _find_images(root: Path) -> dict[int, Path]:
     """Image files by the numbers of their frames."""
     lists = [path for path in (find_file(root, name) for name in ("associations.txt", "rgb.txt")) if path.is_file()]
     if lists:
-        paths = _read_image_list(root, lists[0])
+        paths = _list_colour_images(root, lists[0])
     else:
         paths = [path for path in list_files(root / "rgb") if has_image_suffix(path.name)]
     candidates: dict[int, list[Path]] = {}
@@ -132,7 +132,7 @@ def _find_images(root: Path) -> dict[int, Path]:
     return choose_images(candidates)
 
 
-def _read_image_list(root: Path, path: Path) -> list[Path]:
+def _list_colour_images(root: Path, path: Path) -> list[Path]:
     """The colour images that a list names.
 
     Raises:

@@ -41,7 +41,7 @@ MAX_INDEX_DIGITS = 9
 
 
 def has_image_suffix(name: str) -> bool:
-    """Whether a file's name ends like that of an image, in upper or lower case."""
+    """Whether a file's name ends in the suffix of an image, in upper or lower case."""
     return name.lower().endswith(IMAGE_SUFFIXES)
 
 
@@ -81,10 +81,10 @@ def parse_image_line(line: str) -> tuple[str, str]:
     """The number or time of an image, and its path, from a line of an image list.
 
     A line is `number path`, or `number path number path`, as the TUM benchmark's association tool writes it. Of two
-    paths, the colour image is the one whose name or folder says so (`rgb/1.png`, `depth/1.png`), in either order.
+    paths, the colour image is recognised by its name or folder (`rgb/1.png`, `depth/1.png`), in either order.
 
     Raises:
-        DataError: two images are listed and neither says that it is colour or depth.
+        DataError: two images are listed and neither is named as colour or depth.
         ValueError: the line is of another kind.
     """
     pair = (
@@ -105,13 +105,13 @@ def parse_image_line(line: str) -> tuple[str, str]:
 
 
 class ImageFinder:
-    """Finds listed images under a folder, also where the list differs in its separators, folders, case or extension.
+    """Finds listed images under a folder, also if the list differs in its separators, folders, case or extension.
 
     Args:
         root: the scene's folder.
 
     Attributes:
-        moved: images that are not where the list says: what is listed, and what was found.
+        moved: images that are not where they are listed: what is listed, and what was found.
     """
 
     def __init__(self, root: Path) -> None:
@@ -133,7 +133,7 @@ class ImageFinder:
         return exact
 
     def warn(self, list_name: str) -> None:
-        """Log a warning that names the images that are not where the list says, if there are any."""
+        """Log a warning that names the images that are not where they are listed, if there are any."""
         if self.moved:
             listed, path = self.moved[0]
             log.warning(
@@ -189,7 +189,7 @@ def number_images(names: Sequence[str]) -> list[int]:
     """Number the images of one sequence by their names, so that no two have the same number.
 
     The number is the one in the name, if the names have one number each, or several of which one alone changes. Where
-    no number tells the images apart, or a date or a time stands in the names, images are counted in natural order
+    no number is different in every name, or a date or a time stands in the names, images are counted in natural order
     from 0.
     """
     numbers = [re.findall(r"[0-9]+", PurePosixPath(name).stem) for name in names]
@@ -261,7 +261,7 @@ def _find_kinds(first: str, second: str) -> tuple[str, str]:
 
 
 def _find_kind(path: str) -> str:
-    """`depth` or `colour`, if the path of an image says so; otherwise empty."""
+    """`depth` or `colour`, if the path of an image has such a word; otherwise empty."""
     if re.search(r"depth|disp", path, re.IGNORECASE):
         return "depth"
     return "colour" if re.search(r"rgb|colou?r|image|gr[ae]y|left|cam", path, re.IGNORECASE) else ""

@@ -26,7 +26,7 @@ def check_matrices(T_world_cam: np.ndarray) -> tuple[np.ndarray, np.ndarray, lis
 
     Returns:
         (N, 3) positions and (N, 4) unit quaternions wxyz with w >= 0, float64, and N faults. A fault is empty for a
-        sound pose. Otherwise it says that an entry is not finite, that the last row is not 0 0 0 1, or that the
+        sound pose. Otherwise it is that an entry is not finite, that the last row is not 0 0 0 1, or that the
         rotation is scaled, skewed or mirrored.
     """
     unreadable = np.isfinite(T_world_cam).sum(axis=(1, 2)) < 16
@@ -65,7 +65,7 @@ def check_quats(
 
     Returns:
         (N, 3) positions and (N, 4) unit quaternions wxyz with w >= 0, float64, and N faults. A fault is empty for a
-        sound pose. Otherwise it says that a number is not finite, or that a norm differs from 1 by more than 10 %, more
+        sound pose. Otherwise it is that a number is not finite, or that a norm differs from 1 by more than 10 %, more
         than rounding errors can explain.
     """
     unreadable = np.isfinite(np.column_stack([position_m, quats])).sum(axis=1) < 7

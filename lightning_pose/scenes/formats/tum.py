@@ -55,7 +55,7 @@ class Tum(SceneFormat):
         return all(file.is_file() for file in files) and not is_numbered(root)
 
     def read(self, root: Path) -> Scene:
-        listed = _read_image_list(root, find_file(root, "rgb.txt"))
+        listed = _read_timed_images(root, find_file(root, "rgb.txt"))
         trajectory = find_file(root, "groundtruth.txt")
         table = read_table(trajectory, TRAJECTORY_COLUMNS)
         _warn_of_rows_without_time(trajectory, table)
@@ -132,7 +132,7 @@ def is_numbered(root: Path) -> bool:
     return len(numbers) > 0 and numbers[0] in (0, 1) and bool((numbers == numbers[0] + np.arange(len(numbers))).all())
 
 
-def _read_image_list(root: Path, path: Path) -> ImageList:
+def _read_timed_images(root: Path, path: Path) -> ImageList:
     """Read the image list.
 
     Raises:
@@ -169,7 +169,7 @@ def _read_image_list(root: Path, path: Path) -> ImageList:
 def _convert_to_seconds(times: np.ndarray, header: Sequence[str], path: Path) -> np.ndarray:
     """Times in seconds, with a warning if the file has another unit.
 
-    The unit is nanoseconds if the header says so. Otherwise it follows from the times: seconds since 1970 have 10
+    The unit is nanoseconds if the header names them. Otherwise it follows from the times: seconds since 1970 have 10
     digits, milliseconds 13, microseconds 16 and nanoseconds 19; of times that begin at zero, a step of 100,000 or more
     cannot be seconds.
     """

@@ -216,6 +216,15 @@ def test_sequence_in_no_split_file_is_named(root: Path, caplog: pytest.LogCaptur
     assert "seq-12 have frames but are neither in TrainSplit.txt nor in TestSplit.txt" in caplog.text
 
 
+def test_holes_in_the_numbers_are_said(root: Path, caplog: pytest.LogCaptureFixture) -> None:
+    for path in (root / "seq-12").glob("frame-000002.*"):
+        path.unlink()
+    with caplog.at_level(logging.WARNING, "lightning_pose"):
+        load_scene(root)
+    assert "seq-12: the numbers of frames jump 1 times, first from 1 to 3" in caplog.text
+    assert "seq-01: the numbers" not in caplog.text
+
+
 def test_number_of_5000_digits_is_refused(root: Path) -> None:
     (root / "TestSplit.txt").write_text("sequence" + "3" * 5000)
     with pytest.raises(DataError, match=r"TestSplit.txt:1: expected `sequenceN`"):
