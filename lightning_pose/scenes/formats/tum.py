@@ -61,6 +61,8 @@ class Tum(SceneFormat):
         _warn_of_rows_without_time(trajectory, table)
         pose_times = _convert_to_seconds(table.values[:, 0], table.header, trajectory)
         _warn_of_equal_times(trajectory, pose_times)
+        if _counts_frames(pose_times):
+            log.warning("%s counts frames: if it is ICL-NUIM, with y up in the world, give format icl_nuim", trajectory)
         pairs = pair_by_time(listed.times, pose_times)
         if not len(pairs):
             raise DataError(
@@ -121,15 +123,24 @@ def pair_by_time(times: np.ndarray, pose_times: np.ndarray) -> np.ndarray:
 
 
 def is_numbered(root: Path) -> bool:
-    """Whether `groundtruth.txt` counts frames (0, 1, 2, ... or 1.0, 2.0, 3.0, ...) and the images are `rgb/N.png`.
+    """Whether a folder with `groundtruth.txt` is ICL-NUIM: its lines count frames, and the images are `rgb/N.png`.
 
-    Such a folder is read as ICL-NUIM.
+    Frames are counted 0, 1, 2, ... or 1, 2, 3, ...; beside an `rgb.txt`, numbers with decimals are times.
     """
     images = root / "rgb"
     if not images.is_dir() or not any(path.stem.isdecimal() for path in list_files(images)):
         return False
-    numbers = read_table(find_file(root, "groundtruth.txt"), TRAJECTORY_COLUMNS).values[:, 0]
-    return len(numbers) > 0 and numbers[0] in (0, 1) and bool((numbers == numbers[0] + np.arange(len(numbers))).all())
+    trajectory = find_file(root, "groundtruth.txt")
+    if find_file(root, "rgb.txt").is_file() and any(
+        "." in re.split(r"[\s,;]+", line)[0] for _, line in read_lines(trajectory)
+    ):
+        return False
+    return _counts_frames(read_table(trajectory, TRAJECTORY_COLUMNS).values[:, 0])
+
+
+def _counts_frames(numbers: np.ndarray) -> bool:
+    """Whether numbers are 0, 1, 2, ... or 1, 2, 3, ..."""
+    return len(numbers) > 1 and numbers[0] in (0, 1) and bool((np.diff(numbers) == 1).all())
 
 
 def _read_timed_images(root: Path, path: Path) -> ImageList:

@@ -96,12 +96,16 @@ def test_colour_image_is_told_by_its_name(line: str, tmp_path: Path) -> None:
     assert [f.image.parent.name for f in load_scene(tmp_path).frames] == ["rgb"] * 3
 
 
-def test_numbers_may_have_decimals(tmp_path: Path) -> None:
+def test_numbers_may_have_decimals(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     write(tmp_path)
     (tmp_path / "livingRoom2.gt.freiburg").rename(tmp_path / "groundtruth.txt")
     path = tmp_path / "groundtruth.txt"
     path.write_text("".join(f"{row[0]}.000000{row[1:]}\n" for row in ROWS))
     assert load_scene(tmp_path).format == "icl_nuim"
+    (tmp_path / "rgb.txt").write_text("".join(f"{number}.000000 rgb/{number}.png\n" for number in (1, 2, 3)))
+    with caplog.at_level(logging.WARNING, "lightning_pose"):
+        assert load_scene(tmp_path).format == "tum"
+    assert "counts frames: if it is ICL-NUIM, with y up in the world, give format icl_nuim" in caplog.text
 
 
 def test_files_of_macos_are_no_images_and_no_trajectories(tmp_path: Path) -> None:
