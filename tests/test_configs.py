@@ -21,6 +21,7 @@ FIGURES = {
     "ImageDataModule": {"trajectory.png", "cumulative_errors.png", "error_vs_distance.png"},
     "ClipDataModule": {"trajectory.png", "error_by_length.png"},
 }
+MAP_FIGURES = {"map.png", "error_vs_inliers.png"}
 every_config = pytest.mark.parametrize("config", CONFIGS, ids=lambda path: f"{path.parent.name}-{path.stem}")
 
 
@@ -63,7 +64,8 @@ def test_it_trains_tests_and_keeps_its_results(
     table = capsys.readouterr().out
     for system in [run.data.tags["architecture"], *baselines]:
         assert f" {system} " in table
-    _check_artifacts(workplace, run.info.run_id, room, FIGURES[kind])
+    of_map = MAP_FIGURES if run.data.tags["architecture"] == "LandmarkMap" else set()
+    _check_artifacts(workplace, run.info.run_id, room, FIGURES[kind] | of_map)
 
 
 def _check_record(status: str, metrics: dict[str, float], tags: dict[str, str], baselines: list[str]) -> None:

@@ -82,7 +82,7 @@ def test_equal_frames_will_do() -> None:
     problem = NoisyProblem(val=0)
     problem.data.data.features[:] = 1.0
     position_m, _ = fit(problem)(problem.data.data.features)
-    torch.testing.assert_close(position_m[0], problem.data.data.position_m.mean(0), atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(position_m[0], problem.data.data.position_m.double().mean(0), atol=1e-4, rtol=1e-4)
 
 
 def test_headline_names_what_differs() -> None:

@@ -31,7 +31,9 @@ def test_two_processes_are_one(workplace: Workplace, tmp_path: Path) -> None:
         assert run.info.status == "FINISHED"
         metrics.append(run.data.metrics)
         checkpoint = workplace.checkpoint(run, "best")
-        (line,) = start(workplace, "predict", "--ckpt_path", checkpoint, "--trainer.devices", devices).splitlines()
+        (line,) = start(
+            workplace, "predict", "--ckpt_path", checkpoint, "--trainer.devices", devices, "--allow", "tests"
+        ).splitlines()
         files.append(np.loadtxt(workplace.folder / line))
     alone, together = metrics
     assert alone.keys() == together.keys()
