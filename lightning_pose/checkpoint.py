@@ -140,7 +140,7 @@ def build_object(spec: Mapping[str, Any], allow: str | Iterable[str] = (), packa
 
 
 def check_specs(specs: object, allow: str | Iterable[str] = ()) -> dict[str, Spec | None]:
-    """Check what a checkpoint says of its `model` and its `data`, without importing a class that is not allowed.
+    """Check the specs of `model` and `data` in a checkpoint, without importing a class that is not allowed.
 
     Args:
         specs: a checkpoint's `lightning_pose`.
@@ -262,7 +262,7 @@ def _import_class(path: str, packages: Iterable[str]) -> type:
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
     """Read a checkpoint that `fit` wrote: tensors are memory-mapped on the CPU, class paths are today's.
 
-    Classes that it names are not imported: `check_specs` says which of them may be.
+    Classes that it names are not imported: `check_specs` decides which of them may be.
 
     Raises:
         CheckpointError: the file is missing, unreadable, damaged, or was not written by this project.

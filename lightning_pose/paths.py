@@ -26,7 +26,7 @@ def default_tracking_uri(root: str | Path = "mlruns") -> str:
 
 
 def replace_file(file: Path, data: bytes | memoryview, temporary: Path, sync: bool = False) -> None:
-    """Write a file under a temporary name and rename it, so that nobody reads a part of it; make its folder.
+    """Write a file under a temporary name and rename it, so that no process reads a part of it; make its folder.
 
     Args:
         file: the old one, if there is one, stays as it is until the new one is complete.
@@ -54,7 +54,7 @@ def replace_file(file: Path, data: bytes | memoryview, temporary: Path, sync: bo
 
 
 def _sync_folder(folder: Path) -> None:
-    """Wait until the disk has a folder's names, where the system knows how."""
+    """Wait until the disk has a folder's names, where the system can."""
     with suppress(OSError):  # Windows does not open folders
         number = os.open(folder, os.O_RDONLY)
         try:

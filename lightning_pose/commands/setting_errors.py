@@ -1,4 +1,4 @@
-"""What jsonargparse says of a wrong setting, in one plain line: the setting, what it takes, and what was given."""
+"""Rewrites jsonargparse's message about a wrong setting as one line: the setting, what it takes, what was given."""
 
 from __future__ import annotations
 

@@ -58,7 +58,7 @@ def write_record(file: Path, record: Record, owner: str | None = None) -> None:
     Args:
         file: to write.
         record: arrays by name.
-        owner: says whose record it is: the extractor with its settings, and the image.
+        owner: identifies the extractor with its settings, and the image.
 
     Raises:
         CacheError: as `write_file_atomically`.

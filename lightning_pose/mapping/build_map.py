@@ -74,7 +74,7 @@ class Tracks:
 
 @dataclass(frozen=True)
 class MappedFrames:
-    """All that the building of a map knows.
+    """Frames, tracks and camera of a map, from which a `PointMap` or another map without some frames is made.
 
     Attributes:
         given: the frames with the poses that the dataset gives.
@@ -90,7 +90,7 @@ class MappedFrames:
 
 
 def build_point_map(frames: MapFrames, adjust: bool = False) -> PointMap:
-    """The map of posed frames; `map_frames` says how it is made."""
+    """The map of posed frames, by `map_frames`."""
     return summarize_tracks(map_frames(frames, adjust))
 
 

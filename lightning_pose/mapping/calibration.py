@@ -33,7 +33,7 @@ class Calibration:
 
     Attributes:
         position_factor: by which an answer's `position_sd` becomes a radius that holds 90 % of positions; nan where
-            too few frames were accepted to know.
+            too few frames were accepted.
         orientation_factor: the same for `orientation_sd_deg`.
         position_error: median error of the frames left out, in the scene's unit, refused ones included.
         orientation_error_deg: the same.

@@ -33,7 +33,7 @@ class MapFrames:
     """F posed frames with up to N keypoints each, strongest first.
 
     Keypoints are normalised image coordinates: (pixel - principal point) / focal length, distortion removed. So no
-    stage knows a camera model; `focal_px` turns thresholds in pixels into normalised units.
+    stage depends on a camera model; `focal_px` turns thresholds in pixels into normalised units.
 
     Attributes:
         points: (F, N, 2) float64, normalised image coordinates; zeros past `count`.

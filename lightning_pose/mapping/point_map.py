@@ -1,4 +1,4 @@
-"""PointMap: points of a scene with what they look like, and the training frames that saw them."""
+"""PointMap: points of a scene with their descriptors, and the training frames that saw them."""
 
 from __future__ import annotations
 

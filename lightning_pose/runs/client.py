@@ -173,7 +173,7 @@ class BufferedClient(MlflowClient):
 
 
 def is_unreachable(error: Exception) -> bool:
-    """Whether an exception says that the store is gone, locked or full, and not that a request is wrong."""
+    """Whether an exception means that the store is gone, locked or full, and not that a request is wrong."""
     if isinstance(error, MlflowException):
         return error.error_code not in REFUSALS
     return not isinstance(error, FileNotFoundError)

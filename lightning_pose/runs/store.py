@@ -171,7 +171,7 @@ def _list_parts(file: Path) -> list[Path]:
 
 
 def _count_quiet_seconds(file: Path) -> float:
-    """For how long nobody has written to a database."""
+    """Seconds since a database was last written to."""
     return time.time() - max((part.stat().st_mtime for part in _list_parts(file)), default=0.0)
 
 

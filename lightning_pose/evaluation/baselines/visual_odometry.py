@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -16,6 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemaining
 from torch import Tensor
 
 from lightning_pose.errors import ConfigError
+from lightning_pose.features.fill_job import count_cores
 from lightning_pose.features.matching import match_descriptors
 from lightning_pose.features.opencv import SIFT
 from lightning_pose.geometry.quaternions import quat_rotate
@@ -105,7 +105,7 @@ def run_visual_odometry(
     neighbours = np.stack([rows[:, :-1], rows[:, 1:]], axis=-1)
     unique, which = np.unique(neighbours.reshape(-1, 2), axis=0, return_inverse=True)
     pairs: list[tuple[int, int]] = [(int(a), int(b)) for a, b in unique]
-    found = _estimate_steps(frames, pairs, workers or _count_cores(), progress)
+    found = _estimate_steps(frames, pairs, workers or count_cores(), progress)
     step_position, step_quat = torch.zeros(len(pairs), 3).double(), torch.eye(4)[:1].double().repeat(len(pairs), 1)
     for number, ((a, b), motion) in enumerate(zip(pairs, found, strict=True)):
         if motion is not None:
@@ -200,11 +200,6 @@ def _check_clips(clips: np.ndarray | Tensor, total: int) -> np.ndarray:
     if rows.size and not 0 <= rows.min() <= rows.max() < total:
         raise ConfigError(f"clips name frames {rows.min()} to {rows.max()}; there are {total}, numbered from 0")
     return rows.astype(np.int64)
-
-
-def _count_cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @contextmanager

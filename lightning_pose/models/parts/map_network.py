@@ -132,7 +132,7 @@ class MapNetwork(nn.Module):
     def find_radii(self, answers: list[MapAnswer]) -> tuple[np.ndarray, np.ndarray]:
         """(N,) radii, in the scene's unit and in degrees, that hold 90 % of the errors of accepted answers.
 
-        nan where the training frames did not tell, inf where the map refuses.
+        nan where too few training frames were accepted to calibrate; inf where the map refuses.
         """
         position_factor, orientation_factor = self.calibration.tolist()
         position = np.array([answer.position_sd for answer in answers]) * position_factor
