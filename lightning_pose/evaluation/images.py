@@ -54,7 +54,7 @@ def evaluate_images(trainer: Trainer, module: PoseModule, located: Located, mode
     poses = {name: Pose(*(tensor.double() for tensor in prediction)), **baselines}
     frames = [scene.frames[i] for i in test.frame.tolist()]
     metrics = {system: result.metrics for system, result in baselines.items()}
-    on_map = evaluate_map(module, datamodule) if isinstance(module, LandmarkMap) else MapEvaluation({}, {}, {})
+    on_map = evaluate_map(module, scene, test) if isinstance(module, LandmarkMap) else MapEvaluation({}, {}, {})
     return Evaluation(
         baselines=metrics,
         rows=on_map.rows,

@@ -1,4 +1,4 @@
-"""Evaluation of a landmark map beside its errors: what it accepts, how well it knows its errors, and its figures."""
+"""Evaluation of a landmark map beside its errors: acceptance, coverage of its radii, and figures."""
 
 from __future__ import annotations
 
@@ -10,19 +10,20 @@ import torch
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
-from lightning_pose.data.datamodule import SceneDataModule
+from lightning_pose.data.batches import PoseBatch
 from lightning_pose.figures import maps as map_figures
 from lightning_pose.geometry.quaternions import orientation_error_deg, position_error_m
 from lightning_pose.mapping.map_localizer import MapAnswer
 from lightning_pose.metrics.summary import summarize_errors
 from lightning_pose.models.landmark_map import LandmarkMap
+from lightning_pose.scenes.scene import Scene
 
 __all__ = ["MapEvaluation", "evaluate_map"]
 
 
 @dataclass
 class MapEvaluation:
-    """What a test says of a map.
+    """Results of a test that only a map has.
 
     Attributes:
         metrics: `test/NAME` of `catalog.MAP`; only what is known.
@@ -36,17 +37,19 @@ class MapEvaluation:
 
 
 @torch.inference_mode()
-def evaluate_map(module: LandmarkMap, datamodule: SceneDataModule) -> MapEvaluation:
-    """Locate the test frames again, with all that the map says of each."""
-    scene = datamodule.scene
-    data = datamodule.dataset("test").data
-    answers = module.network.locate(data.features)
-    frames = [scene.frames[i] for i in data.frame.tolist()]
-    truth_m = np.array([frame.position_m for frame in frames])
-    quats = torch.from_numpy(np.array([frame.quat_wxyz for frame in frames]))
+def evaluate_map(module: LandmarkMap, scene: Scene, test: PoseBatch) -> MapEvaluation:
+    """Locate test frames again: `test_step` returned their poses, without inliers, refusals and radii.
+
+    Args:
+        module: with a map.
+        scene: of the frames.
+        test: the frames that were tested, with poses in the world.
+    """
+    answers = module.network.locate(test.features)
+    truth_m = test.position_m.double().numpy()
     found_m = to_world(module, np.array([answer.pose.position for answer in answers]))
     position = position_error_m(torch.from_numpy(found_m), torch.from_numpy(truth_m)).numpy()
-    orientation = orientation_error_deg(torch.from_numpy(stack_quats(answers)), quats).numpy()
+    orientation = orientation_error_deg(torch.from_numpy(stack_quats(answers)), test.quat_wxyz.double()).numpy()
     accepted = np.array([answer.accepted for answer in answers])
     radius, radius_deg = module.network.find_radii(answers)
     radius_m = radius * module.world_frame.scale

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from typing import Any, ClassVar, Literal, cast
 
 import numpy as np
@@ -27,8 +26,6 @@ from lightning_pose.models.parts.memory import TrainingMemory
 
 __all__ = ["LandmarkMap"]
 
-_log = logging.getLogger("lightning_pose")
-
 
 class LandmarkMap(TrainingMemory, PoseModule):
     """A map of triangulated keypoints, in which an image is located by matching, RANSAC and refinement.
@@ -48,7 +45,8 @@ class LandmarkMap(TrainingMemory, PoseModule):
         **kwargs: what `PoseModule` takes. `loss` is only logged; learning rate, decay and schedule are ignored.
 
     Raises:
-        ConfigError: the camera is not understood; in `setup`, the features are not keypoints with their geometry.
+        ConfigError: `camera` or `bundle_adjust` is not understood; in `setup`, the features are not keypoints
+            with their geometry.
     """
 
     input_ranks: ClassVar[tuple[int, ...]] = (2,)
@@ -58,7 +56,7 @@ class LandmarkMap(TrainingMemory, PoseModule):
     def __init__(
         self,
         camera: str | None = None,
-        bundle_adjust: Literal["auto", "true", "false"] | bool = "auto",
+        bundle_adjust: bool | Literal["auto"] = "auto",
         refit: bool = True,
         standardize: bool = False,
         standardize_features: bool = False,
@@ -67,10 +65,12 @@ class LandmarkMap(TrainingMemory, PoseModule):
         super().__init__(standardize=standardize, standardize_features=standardize_features, **kwargs)
         self.automatic_optimization = False
         self.camera = None if camera is None else Camera.parse(camera)
-        self.bundle_adjust = {"true": True, "false": False}.get(str(bundle_adjust).lower())
+        if bundle_adjust not in (True, False, "auto"):
+            raise ConfigError(f"bundle_adjust is {bundle_adjust!r}; give true, false or auto")
+        self.bundle_adjust = bundle_adjust
         self.refit = refit
         self.network = MapNetwork(self.input_shape[1] - 4)
-        self._adjusts = bool(self.bundle_adjust)
+        self._adjusts = bundle_adjust is True
 
     @property
     def headline(self) -> str:
@@ -87,7 +87,8 @@ class LandmarkMap(TrainingMemory, PoseModule):
         if not isinstance(extractor, LocalExtractor) or not extractor.with_geometry:
             raise ConfigError(
                 f"LandmarkMap needs keypoints with their places, and {extractor.name} features have none; "
-                "choose lightning_pose.features.SURF (or SIFT, ORB, AKAZE) and set data.extractor.with_geometry: true"
+                "choose lightning_pose.features.SURF (or SIFT, ORB, FREAK, BRIEF), and set "
+                "data.extractor.with_geometry: true"
             )
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
@@ -137,26 +138,21 @@ class LandmarkMap(TrainingMemory, PoseModule):
         point_map, calibration = summarize_tracks(mapped), calibrate_map(mapped) if calibrate else UNKNOWN
         self.network.set_map(point_map, camera, calibration)
         if calibrate:
-            _log.info(
-                "map of %d frames: %d points, %.1f MB, bundle adjustment %s; training frames left out in turn are "
-                "located to %.3g %s and %.2f degrees (median)",
-                len(frames),
-                len(point_map),
-                point_map.n_bytes / 1e6,
-                "on" if self._adjusts else "off",
-                calibration.position_error * self.world_frame.scale,
-                datamodule.scene.unit,
-                calibration.orientation_error_deg,
+            error_m = calibration.position_error * self.world_frame.scale
+            self.print(
+                f"map of {len(frames)} frames: {len(point_map)} points, {point_map.n_bytes / 1e6:.1f} MB, "
+                f"bundle adjustment {'on' if self._adjusts else 'off'}; training frames left out in turn are located "
+                f"to {error_m:.3g} {datamodule.scene.unit} and {calibration.orientation_error_deg:.2f} degrees (median)"
             )
 
     def _choose_adjusted(
         self, mapped: MappedFrames, datamodule: SceneDataModule, camera: Camera, decided: bool
     ) -> MappedFrames:
         """The map after bundle adjustment, or as it was where that locates validation frames better."""
-        if self.bundle_adjust is None and decided and not self._adjusts:
+        if self.bundle_adjust == "auto" and decided and not self._adjusts:
             return mapped
         adjusted = adjust_mapped(mapped)
-        if self.bundle_adjust is None and not decided:
+        if self.bundle_adjust == "auto" and not decided:
             if len(datamodule.scene.splits["val"]):
                 val = self._read_frames(datamodule, ("val",), camera)
                 before, after = (
@@ -205,5 +201,8 @@ class LandmarkMap(TrainingMemory, PoseModule):
                 f"the camera of {scene.root} is unknown, and its frames do not tell the focal length (too few matches, "
                 "or no motion); give model.camera, such as PINHOLE,640,480,525,525,320,240"
             )
-        _log.info("no camera is given: focal length %.0f px fits the poses best (%.2f px off)", focal_px, residual_px)
+        self.print(
+            f"the camera is unknown: a focal length of {focal_px:.0f} px fits the poses best (matches lie "
+            f"{residual_px:.2f} px off their epipolar lines); model.camera sets another"
+        )
         return Camera(width, height, focal_px, focal_px, (width - 1) / 2, (height - 1) / 2)

@@ -43,8 +43,11 @@ def test_test_frames_are_located_to_a_centimetre(fitted: tuple[LandmarkMap, Wall
     assert position_error_m(model(data.features).position_m, data.position_m).median() < 0.01
 
 
-def test_without_a_camera_the_focal_length_is_found(fitted: tuple[LandmarkMap, WallProblem]) -> None:
+def test_without_a_camera_the_focal_length_is_found_and_printed(capsys: pytest.CaptureFixture[str]) -> None:
     model, problem = fit_wall()
+    printed = capsys.readouterr().out
+    assert "the camera is unknown: a focal length of" in printed
+    assert "map of 60 frames" in printed
     assert model.network.view.focal_px == pytest.approx(500, rel=0.03)
     data = problem.dataset("test").data
     assert position_error_m(model(data.features).position_m, data.position_m).median() < 0.03
@@ -79,7 +82,8 @@ def test_answers_are_accepted_with_a_radius_or_refused_with_a_reason(fitted: tup
 
 
 def test_a_test_says_what_the_map_accepts_and_how_well_it_knows(fitted: tuple[LandmarkMap, WallProblem]) -> None:
-    found = evaluate_map(*fitted)
+    model, problem = fitted
+    found = evaluate_map(model, problem.scene, problem.dataset("test").data)
     assert found.metrics.keys() == {f"test/{name}" for name in catalog.MAP}
     assert found.metrics["test/accepted"] == 1.0
     assert found.metrics["test/coverage_position"] > 0.6
@@ -114,3 +118,8 @@ def test_frames_of_which_nothing_can_be_triangulated_are_refused() -> None:
 def test_a_camera_that_is_not_understood_is_refused(text: str, problem: str) -> None:
     with pytest.raises(ConfigError, match=problem):
         LandmarkMap(input_shape=[50, 68], camera=text)
+
+
+def test_bundle_adjustment_that_is_not_understood_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"bundle_adjust is 'yes'; give true, false or auto"):
+        LandmarkMap(input_shape=[50, 68], bundle_adjust="yes")  # type: ignore[arg-type]
