@@ -170,10 +170,14 @@ class PoseModule(CheckpointHooks):
         return self.decode_features(batch.features)
 
     def standardize_input(self, features: Tensor) -> Tensor:
-        """Features in standard deviations around their mean; as they are without `standardize_features`."""
+        """Features in standard deviations around their mean; as they are without `standardize_features`.
+
+        Of sets of descriptors (N, D), the rows of zeros that fill up a frame with fewer features stay zero.
+        """
         if not self.standardize_features:
             return features
-        return (features - self.feature_mean) / self.feature_scale
+        standardized = (features - self.feature_mean) / self.feature_scale
+        return standardized * features.any(-1, keepdim=True) if len(self.input_shape) == 2 else standardized
 
     def unscale_pose(self, pose: Tensor) -> tuple[Tensor, Tensor]:
         """The network's (..., 7) numbers as local positions (..., 3) and quaternions (..., 4)."""

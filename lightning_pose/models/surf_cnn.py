@@ -22,7 +22,8 @@ class SurfCNN(PoseModule):
     and the last two 1x2, along the descriptor, in ceil mode.
 
     The order by strength changes from frame to frame. With `ordered` off, kernels, strides and pools extend along
-    each descriptor only, and the maps are averaged over the features, so that their order does not matter.
+    each descriptor only, and the maps are averaged over the features, so that their order does not matter. Rows that
+    fill up a frame with fewer features do not count.
 
     Args:
         channels: filters of each convolution.
@@ -109,4 +110,16 @@ class _ConvRegressor(nn.Module):
     def forward(self, descriptors: Tensor) -> Tensor:
         """(B, N, D) -> (B, 7)."""
         maps = self.convolutions(descriptors.unsqueeze(1))  # (B, channels, rows, columns)
-        return self.head(maps if self.ordered else maps.mean(dim=2))
+        return self.head(maps if self.ordered else _average_real_rows(maps, descriptors.any(-1)))
+
+
+def _average_real_rows(maps: Tensor, real: Tensor) -> Tensor:
+    """(B, channels, columns): means of (B, channels, N, columns) over the N features that are `real` (B, N).
+
+    Of all, where none is: the mean of a blank frame is finite.
+    """
+    if real.all():
+        return maps.mean(dim=2)
+    real = real | ~real.any(1, keepdim=True)
+    weight = real.to(maps.dtype)[:, None, :, None]
+    return (maps * weight).sum(dim=2) / weight.sum(dim=2)

@@ -10,10 +10,11 @@ import pytest
 import torch
 
 from lightning_pose.data.batches import PoseBatch
-from lightning_pose.errors import CheckpointError, ConfigError
+from lightning_pose.errors import CheckpointError, ConfigError, DataError
 from lightning_pose.losses import LossConfig
 from lightning_pose.models import PoseModule, SurfCNN, SurfLSTM
-from tests.models.helpers import make_model, random_poses
+from lightning_pose.models.parts.poses import check_features
+from tests.models.helpers import LearnableProblem, features_for, make_model, random_poses
 
 HALF = 0.5**0.5
 EIGHTH = math.pi / 8
@@ -135,3 +136,32 @@ def test_features_are_read_as_they_are_without_standardize_features() -> None:
     model.fit_feature_scale(torch.randn(4, 2, 3))
     np.testing.assert_allclose(model.feature_mean, np.zeros((1, 3)))
     np.testing.assert_allclose(model.feature_scale, np.ones((1, 3)))
+
+
+def test_rows_that_fill_up_a_frame_stay_zero() -> None:
+    model = make_model(SurfCNN)
+    features = features_for(model, 6) + 3
+    features[:, 15:] = 0
+    model.fit_feature_scale(features)
+    standardized = model.standardize_input(features)
+    assert not standardized[:, 15:].any()
+    assert standardized[:, :15].mean().abs() < 1e-5
+
+
+def test_filling_rows_do_not_change_an_unordered_answer() -> None:
+    torch.manual_seed(0)
+    short, long = (SurfCNN(input_shape=[rows, 64], ordered=False).eval() for rows in (12, 20))
+    long.load_state_dict(short.state_dict())
+    features = torch.randn(3, 12, 64)
+    padded = torch.cat([features, torch.zeros(3, 8, 64)], dim=1)
+    torch.testing.assert_close(long(padded).position_m, short(features).position_m, atol=1e-5, rtol=1e-5)
+
+
+def test_frames_without_features_are_counted_or_refused(caplog: pytest.LogCaptureFixture) -> None:
+    data = LearnableProblem([20, 64]).data.data
+    data.features[:3] = 0
+    check_features(data)
+    assert "3 of 24 training frames have no features" in caplog.text
+    data.features[:20] = 0
+    with pytest.raises(DataError, match=r"20 of 24 training frames have no features.*check"):
+        check_features(data)

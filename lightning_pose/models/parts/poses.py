@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from typing import NamedTuple
 
 import torch
@@ -11,6 +12,8 @@ from lightning_pose.data.batches import PoseBatch
 from lightning_pose.errors import DataError
 
 __all__ = ["Located", "Pose", "check_features", "check_poses"]
+
+_log = logging.getLogger("lightning_pose")
 
 
 class Pose(NamedTuple):
@@ -35,12 +38,30 @@ class Located(NamedTuple):
 
 
 def check_features(data: PoseBatch) -> None:
-    """Raise DataError if features of some frames are not finite numbers."""
+    """Warn of frames without features.
+
+    Raises:
+        DataError: features of some frames are not finite numbers, or most frames have no features.
+    """
     bad = [int(i) for i, row in zip(data.frame, data.features, strict=True) if not bool(row.isfinite().all())]
     if bad:
         raise DataError(
             f"{len(bad)} of {len(data.frame)} training frames have features that are not finite numbers, the first is "
             f"frame {bad[0]} of the scene; check the extractor, or leave these frames out"
+        )
+
+    empty = [int(i) for i, row in zip(data.frame, data.features, strict=True) if not bool(row.any())]
+    if 2 * len(empty) > len(data.frame):
+        raise DataError(
+            f"{len(empty)} of {len(data.frame)} training frames have no features, the first is frame {empty[0]} of the "
+            "scene; `python -m lightning_pose check` looks for blank and tiny images"
+        )
+    if empty:
+        _log.warning(
+            "%d of %d training frames have no features, the first is frame %d of the scene",
+            len(empty),
+            len(data.frame),
+            empty[0],
         )
 
 
