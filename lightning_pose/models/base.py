@@ -13,15 +13,15 @@ from torch import Tensor, nn
 from lightning_pose.data.batches import PoseBatch, PoseDataset
 from lightning_pose.data.datamodule import SceneDataModule, find_datamodule, scene_datamodule
 from lightning_pose.errors import ConfigError
-from lightning_pose.geometry.quaternions import align_hemisphere, mean_quat, quat_normalize
+from lightning_pose.geometry.quaternions import align_hemisphere, quat_normalize
 from lightning_pose.losses import LossConfig, PoseLoss
 from lightning_pose.metrics.item_means import ItemMeans, key_items, key_poses
 from lightning_pose.metrics.pose_metrics import PoseMetrics
 from lightning_pose.models.parts.checkpoint_hooks import CheckpointHooks
 from lightning_pose.models.parts.divergence import DivergenceWatch
 from lightning_pose.models.parts.poses import Located, Pose, check_features, check_poses
-from lightning_pose.models.parts.scaling import measure_columns, measure_poses
 from lightning_pose.models.parts.schedule import cosine_factor
+from lightning_pose.models.parts.standardization import StandardizedModule
 from lightning_pose.models.parts.world_frame import WorldFrame
 
 __all__ = ["Located", "Pose", "PoseModule"]
@@ -32,7 +32,7 @@ Stage = Literal["train", "val", "test"]
 warnings.filterwarnings("ignore", message=".*overridden `on_before_batch_transfer` in `LightningModule`")
 
 
-class PoseModule(CheckpointHooks):
+class PoseModule(CheckpointHooks, StandardizedModule):
     """Base class of the architectures.
 
     To add one, subclass it in a file of its own, call `super().__init__(**kwargs)` first, and set `input_ranks` and
@@ -82,11 +82,6 @@ class PoseModule(CheckpointHooks):
     reads_clips: ClassVar[bool] = False
     """Whether features are those of clips, (B, T, *input_shape), as data modules with `gives_clips` have them."""
     network: nn.Module
-    pose_mean: Tensor
-    pose_scale: Tensor
-    quat_reference: Tensor
-    feature_mean: Tensor
-    feature_scale: Tensor
 
     def __init__(
         self,
@@ -123,18 +118,7 @@ class PoseModule(CheckpointHooks):
         self.divergence = DivergenceWatch()
         self.val_metrics, self.val_losses = PoseMetrics(), ItemMeans()
         self.test_metrics, self.test_losses = PoseMetrics(), ItemMeans()
-        self.register_buffer("pose_mean", torch.zeros(7))
-        self.register_buffer("pose_scale", torch.ones(7))
-        self.register_buffer("quat_reference", torch.tensor([1.0, 0.0, 0.0, 0.0]))
-        columns = [1] * len(self.input_shape)
-        columns[self.feature_axis] = self.input_shape[self.feature_axis]
-        self.register_buffer("feature_mean", torch.zeros(columns))
-        self.register_buffer("feature_scale", torch.ones(columns))
-
-    @property
-    def feature_axis(self) -> int:
-        """The axis of `input_shape` with the columns to standardize, counted from the last."""
-        return -1
+        self.register_scales()
 
     @property
     def headline(self) -> str:
@@ -169,42 +153,6 @@ class PoseModule(CheckpointHooks):
         """
         return self.decode_features(batch.features)
 
-    def standardize_input(self, features: Tensor) -> Tensor:
-        """Features in standard deviations around their mean; as they are without `standardize_features`.
-
-        Of sets of descriptors (N, D), the rows of zeros that fill up a frame with fewer features stay zero.
-        """
-        if not self.standardize_features:
-            return features
-        standardized = (features - self.feature_mean) / self.feature_scale
-        return standardized * features.any(-1, keepdim=True) if len(self.input_shape) == 2 else standardized
-
-    def unscale_pose(self, pose: Tensor) -> tuple[Tensor, Tensor]:
-        """The network's (..., 7) numbers as local positions (..., 3) and quaternions (..., 4)."""
-        pose = pose * self.pose_scale + self.pose_mean
-        return pose[..., :3], pose[..., 3:]
-
-    def fit_scale(self, position: Tensor, quat_wxyz: Tensor) -> None:
-        """Learn the hemisphere of the targets, and with `standardize` their mean and spread.
-
-        Args:
-            position: (M, 3) of training, local.
-            quat_wxyz: (M, 4) of training.
-        """
-        self.quat_reference.copy_(mean_quat(quat_wxyz))
-        self.divergence.spread_m = float((position - position.mean(0)).norm(dim=-1).mean())
-        if self.standardize:
-            mean, spread = measure_poses(position, quat_wxyz, self.quat_reference)
-            self.pose_mean.copy_(mean)
-            self.pose_scale.copy_(spread)
-
-    def fit_feature_scale(self, features: Tensor) -> None:
-        """With `standardize_features`, learn each column's mean and spread from (M, *input_shape) training features."""
-        found = measure_columns(features, self.feature_axis) if self.standardize_features else None
-        if found is not None:
-            self.feature_mean.copy_(found[0].view_as(self.feature_mean))
-            self.feature_scale.copy_(found[1].view_as(self.feature_scale))
-
     def check_data(self, datamodule: SceneDataModule) -> None:
         """Refuse data that this architecture cannot read; the command line asks before it opens a run.
 
@@ -234,6 +182,7 @@ class PoseModule(CheckpointHooks):
             self.fit_world_frame(train)
             position_m, quat_wxyz = self.training_poses(train)
             position = self.world_frame.to_local(position_m)
+            self.divergence.spread_m = float((position - position.mean(0)).norm(dim=-1).mean())
             self.fit_scale(position.to(self.pose_mean), quat_wxyz.to(self.quat_reference))
             self.fit_feature_scale(train.data.features)
 
