@@ -109,7 +109,7 @@ class SceneDataModule(LightningDataModule):
             self._datasets[split] = self._make_dataset(split, self._read(split, self.cache))
         return self._datasets[split]
 
-    def measure_image(self, split: str) -> tuple[int, int]:
+    def find_image_size(self, split: str) -> tuple[int, int]:
         """Width and height of the first image of a split; those of a scene are alike."""
         first = self.scene.frames[int(self.scene.splits[split][0])]
         height, width = read_gray(first.image).shape

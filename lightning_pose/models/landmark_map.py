@@ -182,7 +182,7 @@ class LandmarkMap(TrainingMemory, PoseModule):
         """The camera of the setting, of the dataset, or with the focal length that fits the training poses."""
         scene = datamodule.scene
         first = scene.frames[int(scene.splits["train"][0])]
-        width, height = datamodule.measure_image("train")
+        width, height = datamodule.find_image_size("train")
         if self.camera is not None:
             return self.camera.resize(width, height)
         if first.intrinsics is not None:

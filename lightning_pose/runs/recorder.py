@@ -17,7 +17,6 @@ from lightning_pose.runs.checkpoints import checkpoint_folder, run_logger
 from lightning_pose.runs.logger import MLflowLogger, flatten_settings
 from lightning_pose.runs.resume import read_seed
 from lightning_pose.runs.tags import OPERATIONAL
-from lightning_pose.scenes.images import read_gray
 
 __all__ = ["RunRecorder"]
 
@@ -133,9 +132,9 @@ def _test_tags(datamodule: SceneDataModule, module: PoseModule) -> dict[str, str
     if module.reads_clips:
         tags |= {name: str(getattr(datamodule, name)) for name in ("clip_length", "stride", "relative_frame")}
     if len(test):
-        # Of one frame: those of a scene are alike. Cached features do without images, so one may be gone.
+        # Cached features do without images, so one may be gone.
         with contextlib.suppress(ImageError):
-            height, width = read_gray(scene.frames[test[0]].image).shape
+            width, height = datamodule.find_image_size("test")
             tags["image_size"] = f"{width}x{height}"
     return tags
 

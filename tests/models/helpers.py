@@ -192,7 +192,7 @@ class WallProblem(LearnableProblem):
         splits = {split: part.data.frame.numpy() for split, part in self.splits.items()}
         self._scene = Scene("wall", Path("wall"), "wall", tuple(frames), splits)
 
-    def measure_image(self, split: str) -> tuple[int, int]:
+    def find_image_size(self, split: str) -> tuple[int, int]:
         return 640, 480
 
 
