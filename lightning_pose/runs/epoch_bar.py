@@ -32,17 +32,17 @@ class EpochBar(ProgressBar):
         super().__init__()
         self._bar: Progress | None = None
         self._task = TaskID(0)
-        self._on = True
+        self.is_enabled = True  # LightningModule.print reads it
 
     def disable(self) -> None:
-        self._on = False
+        self.is_enabled = False
 
     def enable(self) -> None:
-        self._on = True
+        self.is_enabled = True
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         console = Console(stderr=True)
-        if self._on and console.is_terminal:
+        if self.is_enabled and console.is_terminal:
             columns = (
                 TextColumn("epoch"), MofNCompleteColumn(), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn(),
                 TextColumn("{task.description}", markup=False),
@@ -52,7 +52,7 @@ class EpochBar(ProgressBar):
             self._bar.start()
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        if not self._on:
+        if not self.is_enabled:
             return
         done, total = trainer.current_epoch + 1, trainer.max_epochs or 0
         shown = {label: trainer.callback_metrics.get(name) for name, label in SHOWN.items()}

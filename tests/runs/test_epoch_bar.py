@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from lightning import LightningModule, Trainer
 from rich.console import Console
 
 from lightning_pose.runs import epoch_bar
@@ -67,3 +68,10 @@ def test_switched_off(capsys: pytest.CaptureFixture[str]) -> None:
     bar.enable()
     run(bar, 1)
     assert "1/1" in capsys.readouterr().err
+
+
+def test_what_a_module_prints_passes_by_the_bar(capsys: pytest.CaptureFixture[str]) -> None:
+    module = LightningModule()
+    module.trainer = Trainer(callbacks=[EpochBar()], logger=False, enable_checkpointing=False)
+    module.print("a map of 5000 points")
+    assert capsys.readouterr().out == "a map of 5000 points\n"
