@@ -64,6 +64,8 @@ class ClipDataModule(SceneDataModule):
         room_frames: how many frames of each.
         on_bad_frame: `refuse` a scene with frames whose pose or image is missing or useless, or `drop` these frames and
             say how many there are.
+        split: which frames to test on: `every_5` (any number), `folders:NAME,NAME`, `blocks`, or a text file with
+            `IMAGE train|val|test` in each line; the format's own split, or blocks, if not given.
 
     Raises:
         ConfigError: a number is out of its range, or scenes are named in two ways.
@@ -98,6 +100,7 @@ class ClipDataModule(SceneDataModule):
         test_rooms: list[int] = [1],  # noqa: B006
         room_frames: int = 300,
         on_bad_frame: OnBadFrame = "refuse",
+        split: str | None = None,
     ) -> None:
         super().__init__(extractor, batch_size, eval_batch_size, cache_dir, workers)
         check_relative_frame(relative_frame)
@@ -105,7 +108,7 @@ class ClipDataModule(SceneDataModule):
             raise ConfigError(f"data.clip_length is {clip_length}; give 2 to {LONGEST} frames")
         self._shape = ClipShape(clip_length, stride, hop)
         self._folders = SceneFolders(
-            root, train_scenes, test_scenes, val_scenes, format, val_fraction, ground_truth, pgt, on_bad_frame
+            root, train_scenes, test_scenes, val_scenes, format, val_fraction, ground_truth, pgt, on_bad_frame, split
         )
         self.root = root
         self.train_scenes = train_scenes
@@ -128,6 +131,7 @@ class ClipDataModule(SceneDataModule):
         self.test_rooms = test_rooms
         self.room_frames = room_frames
         self.on_bad_frame: OnBadFrame = on_bad_frame
+        self.split = split
 
     def _load_scene(self) -> Scene:
         rooms = None

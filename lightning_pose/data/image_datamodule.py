@@ -47,6 +47,8 @@ class ImageDataModule(SceneDataModule):
         room_frames: how many frames of it.
         on_bad_frame: `refuse` a scene with frames whose pose or image is missing or useless, or `drop` these frames and
             say how many there are.
+        split: which frames to test on: `every_5` (any number), `folders:NAME,NAME`, `blocks`, or a text file with
+            `IMAGE train|val|test` in each line; the format's own split, or blocks, if not given.
 
     Raises:
         ConfigError: a number is out of its range, scenes are named in two ways, or are in different worlds.
@@ -72,10 +74,11 @@ class ImageDataModule(SceneDataModule):
         room_seed: int = 0,
         room_frames: int = 300,
         on_bad_frame: OnBadFrame = "refuse",
+        split: str | None = None,
     ) -> None:
         super().__init__(extractor, batch_size, eval_batch_size, cache_dir, workers)
         self._folders = SceneFolders(
-            root, train_scenes, test_scenes, val_scenes, format, val_fraction, ground_truth, pgt, on_bad_frame
+            root, train_scenes, test_scenes, val_scenes, format, val_fraction, ground_truth, pgt, on_bad_frame, split
         )
         self.root = root
         self.train_scenes = train_scenes
@@ -90,6 +93,7 @@ class ImageDataModule(SceneDataModule):
         self.room_seed = room_seed
         self.room_frames = room_frames
         self.on_bad_frame: OnBadFrame = on_bad_frame
+        self.split = split
 
     def _load_scene(self) -> Scene:
         rooms = None

@@ -9,6 +9,7 @@ from pathlib import Path
 from lightning_pose.errors import ConfigError
 from lightning_pose.scenes.combine import check_one_world, join_scenes
 from lightning_pose.scenes.formats import OnBadFrame, load_scene
+from lightning_pose.scenes.formats.split_rules import check_split_rule
 from lightning_pose.scenes.ground_truth import GroundTruth, apply_ground_truth, check_ground_truth
 from lightning_pose.scenes.scene import Scene
 
@@ -32,6 +33,7 @@ class SceneFolders:
         ground_truth: as for `apply_ground_truth`.
         pgt: likewise.
         on_bad_frame: as for `load_scene`.
+        split: likewise.
 
     Raises:
         ConfigError: scenes are named in two ways, none to train on is named, or settings contradict each other.
@@ -46,9 +48,12 @@ class SceneFolders:
     ground_truth: GroundTruth = "original"
     pgt: str | None = None
     on_bad_frame: OnBadFrame = "refuse"
+    split: str | None = None
 
     def __post_init__(self) -> None:
         check_ground_truth(self.ground_truth, self.pgt)
+        if self.split is not None:
+            check_split_rule(self.split)
         others = {"test_scenes": self.test_scenes, "val_scenes": self.val_scenes}
         if self.root is not None and (self.train_scenes or any(others.values())):
             raise ConfigError(
@@ -97,7 +102,7 @@ class SceneFolders:
         An official test split stays apart even then.
         """
         test_fraction = TEST_FRACTION if tested else 0.0
-        scene = load_scene(folder, self.format, val_fraction, test_fraction, val_block, self.on_bad_frame)
+        scene = load_scene(folder, self.format, val_fraction, test_fraction, val_block, self.on_bad_frame, self.split)
         return apply_ground_truth(scene, self.ground_truth, self.pgt)
 
 

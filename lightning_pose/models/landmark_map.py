@@ -187,7 +187,7 @@ class LandmarkMap(TrainingMemory, PoseModule):
             return self.camera.resize(width, height)
         if first.intrinsics is not None:
             known = first.intrinsics.for_size(width, height)
-            return Camera(width, height, known.fx, known.fy, known.cx, known.cy, known.distortion)
+            return Camera(width, height, known.fx, known.fy, known.cx, known.cy, known.distortion, known.fisheye)
         guess = Camera(width, height, 1.0, 1.0, (width - 1) / 2, (height - 1) / 2)
         frames = self._read_frames(datamodule, ("train",), guess)
         sequences = [scene.frames[i].sequence for i in datamodule.dataset("train").data.frame.tolist()]
