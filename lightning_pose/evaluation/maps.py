@@ -45,7 +45,7 @@ def evaluate_map(module: LandmarkMap, scene: Scene, test: PoseBatch) -> MapEvalu
         scene: of the frames.
         test: the frames that were tested, with poses in the world.
     """
-    answers = module.network.locate(test.features)
+    answers = module.locate_frames(test)
     truth_m = test.position_m.double().numpy()
     found_m = to_world(module, np.array([answer.pose.position for answer in answers]))
     position = position_error_m(torch.from_numpy(found_m), torch.from_numpy(truth_m)).numpy()

@@ -10,8 +10,9 @@ import numpy as np
 import torch
 
 from lightning_pose.checkpoint import build_object, check_specs, read_checkpoint
-from lightning_pose.errors import CheckpointError
+from lightning_pose.errors import CheckpointError, ConfigError
 from lightning_pose.features.base import FeatureExtractor
+from lightning_pose.geometry.camera import Camera
 from lightning_pose.geometry.relative import RelativeFrame
 from lightning_pose.localization.sequences import locate_sequence
 
@@ -64,21 +65,23 @@ class Localizer:
         return cls(build_object(data["extractor"], allow, "lightning_pose.features"), model, clips)
 
     def __call__(
-        self, images: str | Path | np.ndarray | Sequence[str | Path | np.ndarray]
+        self,
+        images: str | Path | np.ndarray | Sequence[str | Path | np.ndarray],
+        camera: str | Camera | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Locate images.
 
         Args:
             images: M files, or uint8 arrays as `extractor.color` asks for: (H, W) gray or (H, W, 3) RGB. One image
-                may stand alone, and is a list of one.
-
         Returns:
             position_m (M, 3) and quat_wxyz (M, 4), camera-to-world. For a model of clips the images are one video, in
             order, and the world is the first camera.
 
         Raises:
+            ConfigError: the camera is not understood, not used, or for images of another shape.
             ImageError: an image cannot be read.
         """
+        camera = Camera.parse(camera) if isinstance(camera, str) else camera
         extractor, axes = self.extractor, 2 if self.extractor.color == "gray" else 3
         if isinstance(images, str | Path) or (isinstance(images, np.ndarray) and images.ndim == axes):
             images = [images]
@@ -88,8 +91,10 @@ class Localizer:
         records = extractor.extract(arrays)
         features = torch.from_numpy(np.stack([extractor.features(record) for record in records]))
         if self.clips is not None:
+            if camera is not None:
+                raise ConfigError(f"{type(self.model).__name__} does not use cameras; leave camera out")
             chained = locate_sequence(self.model, features, *self.clips)
             return chained[0].numpy(), chained[1].numpy()
         with torch.inference_mode():
-            pose = self.model(features)
+            pose = self.model.locate_images(features, [array.shape[1::-1] for array in arrays], camera)
         return pose.position_m.numpy(), pose.quat_wxyz.numpy()

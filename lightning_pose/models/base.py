@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import ClassVar, Literal
 
@@ -13,6 +14,7 @@ from torch import Tensor, nn
 from lightning_pose.data.batches import PoseBatch, PoseDataset
 from lightning_pose.data.datamodule import SceneDataModule, find_datamodule, scene_datamodule
 from lightning_pose.errors import ConfigError
+from lightning_pose.geometry.camera import Camera
 from lightning_pose.geometry.quaternions import align_hemisphere, quat_normalize
 from lightning_pose.losses import LossConfig, PoseLoss
 from lightning_pose.metrics.item_means import ItemMeans, key_items, key_poses
@@ -53,6 +55,7 @@ class PoseModule(CheckpointHooks, StandardizedModule):
     | `reduced_shape` | seldom | the shape of a frame's features once a fixed projection has reduced them |
     | `training_splits` | seldom | the splits whose poses end up in the weights |
     | `memory` | seldom | with `TrainingMemory`: what the checkpoint carries of every training frame |
+    | `locate_images` | seldom | poses of images whose size, and perhaps camera, are known |
     | `reads_clips`, `check_data`, `training_poses`, `select_judged` | for clips | see `ClipModule` |
 
     With `standardize`, the seven numbers are in standard deviations around the mean training pose; otherwise they are
@@ -152,6 +155,21 @@ class PoseModule(CheckpointHooks, StandardizedModule):
         For an architecture that augments features in training, or uses which frames they are of.
         """
         return self.decode_features(batch.features)
+
+    def locate_images(self, features: Tensor, sizes: Sequence[tuple[int, int]], camera: Camera | None = None) -> Pose:
+        """Poses in the world of images from anywhere, as a `Localizer` has them.
+
+        Args:
+            features: (B, *input_shape).
+            sizes: width and height of each image, in pixels; only systems that read cameras use them.
+            camera: of all images, scaled to each; that of the training images if None.
+
+        Raises:
+            ConfigError: a camera is given, and the architecture reads none.
+        """
+        if camera is not None:
+            raise ConfigError(f"{type(self).__name__} does not use cameras; leave camera out")
+        return self(features)
 
     def check_data(self, datamodule: SceneDataModule) -> None:
         """Refuse data that this architecture cannot read; the command line asks before it opens a run.
