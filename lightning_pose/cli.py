@@ -16,7 +16,7 @@ from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from lightning_pose.checkpoint import check_specs, find_class_paths, read_checkpoint
-from lightning_pose.commands.config_parser import ALLOW_HELP, PROGRAM, PoseParser, parser_settings, rename_value
+from lightning_pose.commands.config_parser import ALLOW_HELP, PoseParser, parser_settings, rename_value
 from lightning_pose.commands.setting_errors import REMEDY, explain_setting_error
 from lightning_pose.data import SceneDataModule, require_clips
 from lightning_pose.errors import ConfigError
@@ -58,7 +58,7 @@ class PoseCLI(LightningCLI):
         filter_messages()
         self.recorder = RunRecorder()
         self.last = LastCheckpoint()
-        self.verb_parsers: dict[str, LightningArgumentParser] = {}
+        self._verb = args[0] if run else None
         self._checkpoint: str | None = None
         super().__init__(
             model_class=PoseModule,
@@ -78,15 +78,17 @@ class PoseCLI(LightningCLI):
             auto_configure_optimizers=False,
             load_from_checkpoint_support=False,  # checkpoints carry their own plain settings
             parser_class=PoseParser,
-            parser_kwargs={verb: parser_settings(verb) for verb in self.subcommands()}
-            if run
-            else parser_settings("extract"),
+            parser_kwargs={args[0]: parser_settings(args[0])} if run else parser_settings("extract"),
             args=_with_saved_config(args) if run else _require_config("extract", args),
             run=run,
         )
 
+    def subcommands(self) -> dict[str, set[str]]:
+        """The verb that is run, and what its parser skips; Lightning would prepare the parsers of all four."""
+        return {verb: skipped for verb, skipped in LightningCLI.subcommands().items() if verb == self._verb}
+
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
-        self.verb_parsers[str(parser.prog).removeprefix(PROGRAM).strip()] = parser
+        self.settings_parser = parser
         parser.link_arguments("data.input_shape", "model.init_args.input_shape", apply_on="instantiate")
         parser.add_lightning_class_args(BestCheckpoint, "best")
         parser.add_lightning_class_args(TestReport, "report")
@@ -149,15 +151,12 @@ class PoseCLI(LightningCLI):
         config.ckpt_path = str(checkpoint)
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
-        if self.subcommand is None:
-            config, parser = self.config, self.parser
-        else:
-            config, parser = self.config[self.subcommand], self.verb_parsers[self.subcommand]
+        config = self.config if self.subcommand is None else self.config[self.subcommand]
         for name in COUNTS:
             count = config.trainer[name]
             if count is not None and count < 1:
                 raise ConfigError(f"trainer.{name} is {count}; give 1 or more")
-        self.recorder.config_yaml = parser.dump(config, skip_unset=False)
+        self.recorder.config_yaml = self.settings_parser.dump(config, skip_unset=False)
         return super().instantiate_trainer(**kwargs)
 
     def after_fit(self) -> None:

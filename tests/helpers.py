@@ -27,6 +27,7 @@ from mlflow.entities import Run
 
 from lightning_pose.__main__ import main
 from lightning_pose.features.base import FeatureExtractor, Record
+from tests.processes import ForkedProcess
 
 __all__ = [
     "REPOSITORY",
@@ -248,8 +249,13 @@ class Workplace:
         with contextlib.chdir(self.folder), mock.patch.dict(os.environ, self.environment):
             return main([str(arg) for arg in args])
 
+    def fork(self, *args: object) -> ForkedProcess:
+        """One command in a process of its own, which need not import anything."""
+        words = [str(arg) for arg in args]
+        return ForkedProcess(main, words, folder=self.folder, environment=self.environment)
+
     def start(self, *args: object) -> subprocess.Popen[str]:
-        """One command through the real entry point, in a process of its own."""
+        """One command through the real entry point, in a fresh Python."""
         return subprocess.Popen(
             [sys.executable, "-m", "lightning_pose", *map(str, args)],
             cwd=self.folder,

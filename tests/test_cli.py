@@ -126,11 +126,11 @@ def test_a_stopped_run_is_killed_and_goes_on(callback: str, code: int, workplace
 
 
 def test_a_killed_process(workplace: Workplace) -> None:
-    """Through the real entry point: SIGINT ends in order, SIGKILL leaves a run that the next one closes."""
+    """SIGINT ends in order, SIGKILL leaves a run that the next one closes."""
     endless = ["fit", "--config", workplace.config, "--trainer.max_epochs", "100000"]
     outcome = {}
     for number in (signal.SIGKILL, signal.SIGINT):
-        process = workplace.start(*endless)
+        process = workplace.fork(*endless)
         try:
             seen = len(list(workplace.folder.glob("mlruns/checkpoints/*/last.ckpt")))
             deadline = time.monotonic() + 200

@@ -13,7 +13,7 @@ from lightning_pose.checkpoint import resolve_class_path, resolve_class_paths
 from lightning_pose.commands.setting_errors import explain_setting_error
 from lightning_pose.errors import ConfigError
 
-__all__ = ["ALLOW_HELP", "PROGRAM", "PoseParser", "parser_settings", "rename_value"]
+__all__ = ["ALLOW_HELP", "PoseParser", "parser_settings", "rename_value"]
 
 
 class _HelpFormatter(argparse.RawDescriptionHelpFormatter, DefaultHelpFormatter):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any, NoReturn
+from typing import NoReturn
 
 from lightning_pose.errors import ConfigError
 
@@ -15,12 +15,22 @@ class VerbParser(argparse.ArgumentParser):
 
     Args:
         verb: what follows `python -m lightning_pose`.
-        **kwargs: of `argparse.ArgumentParser`.
+        usage: the line above the help; argparse makes one if it is not given.
+        description: the help's text.
+        epilog: below the options.
     """
 
-    def __init__(self, verb: str, **kwargs: Any) -> None:
-        layout = {"formatter_class": argparse.RawDescriptionHelpFormatter, "allow_abbrev": False}
-        super().__init__(prog=f"python -m lightning_pose {verb}", **layout | kwargs)
+    def __init__(
+        self, verb: str, usage: str | None = None, description: str | None = None, epilog: str | None = None
+    ) -> None:
+        super().__init__(
+            f"python -m lightning_pose {verb}",
+            usage,
+            description,
+            epilog,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+            allow_abbrev=False,
+        )
 
     def error(self, message: str) -> NoReturn:
         raise ConfigError(f"{message}; `{self.prog} --help` explains every option")

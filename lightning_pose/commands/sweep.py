@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable
 from datetime import date
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import yaml
 from rich.console import Console
@@ -202,10 +202,10 @@ def _write_results(
         print(f"the best on validation frames: python -m lightning_pose fit --config {config}")
 
 
-def _split_arguments(argv: list[str]) -> tuple[list[str], dict[str, Any]]:
+def _split_arguments(argv: list[str]) -> tuple[list[str], dict[str, object]]:
     """The verb's own arguments, and the settings of the config, whose names have dots."""
     own: list[str] = []
-    overrides: dict[str, Any] = {}
+    overrides: dict[str, object] = {}
     words = iter(argv)
     for word in words:
         name, equals, value = word.removeprefix("--").partition("=")
@@ -221,7 +221,7 @@ def _split_arguments(argv: list[str]) -> tuple[list[str], dict[str, Any]]:
     return own, overrides
 
 
-def parse_value(text: str) -> Any:
+def parse_value(text: str) -> object:
     """A setting's value as YAML has it; a date or a number such as 00 is text, because it is a folder's name."""
     try:
         value = yaml.safe_load(text)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from typing import Any
+from typing import TypedDict
 
 import numpy as np
 import torch
@@ -11,8 +11,14 @@ from torch import distributed
 
 __all__ = ["RandomState", "collect_random_states", "restore_random_state"]
 
-RandomState = dict[str, Any]
-"""Plain types and tensors, which checkpoints may hold: states of `python`, `numpy`, `torch` and each `cuda` device."""
+
+class RandomState(TypedDict):
+    """Plain types and tensors, which checkpoints may hold; `cuda` has the state of each device."""
+
+    python: tuple[object, ...]
+    numpy: tuple[str, list[int], int, int, float]
+    torch: torch.Tensor
+    cuda: list[torch.Tensor]
 
 
 def _read_random_state() -> RandomState:

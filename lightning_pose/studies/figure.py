@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from statistics import fmean
-from typing import Any
 
 import matplotlib
 import numpy as np
@@ -128,9 +127,10 @@ def _place_values(lines: Lines, spec: FigureSpec) -> tuple[dict[str, float], boo
     They are where a line is drawn over numbers, or over lists of one number; other values are placed in their order.
     """
     values = {_name_x(group, spec): group.values.get(spec.x) for groups in lines.values() for group in groups}
-    plain: dict[str, Any] = {k: v[0] if isinstance(v, list) and len(v) == 1 else v for k, v in values.items()}
-    if spec.kind == "line" and all(isinstance(v, int | float) and not isinstance(v, bool) for v in plain.values()):
-        return {name: float(value) for name, value in plain.items()}, True
+    plain = {k: v[0] if isinstance(v, list) and len(v) == 1 else v for k, v in values.items()}
+    numbers = {k: float(v) for k, v in plain.items() if isinstance(v, int | float) and not isinstance(v, bool)}
+    if spec.kind == "line" and len(numbers) == len(plain):
+        return numbers, True
     return {name: float(i) for i, name in enumerate(plain)}, False
 
 

@@ -60,7 +60,7 @@ def write_markdown(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 def _read_keypoints(plan: Plan, group: Group) -> tuple[str, FrameKeypoints]:
     """The name of a group's scene, and the keypoints of one of its frames."""
-    data, images = open_keypoint_data(ParsedConfig(plan.arguments(group.values)))
+    data, _, images = open_keypoint_data(ParsedConfig(plan.arguments(group.values)))
     frame = read_frame_keypoints(data.cache, data.scene.name, images)
     return group.names[SCENE] if group.values.get(SCENE) else frame.scene, frame
 

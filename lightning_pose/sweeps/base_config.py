@@ -6,12 +6,12 @@ import copy
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import yaml
 from lightning.pytorch.utilities.seed import isolate_rng
 
 from lightning_pose.cli import PoseCLI
+from lightning_pose.data.datamodule import SceneDataModule
 from lightning_pose.errors import ConfigError
 from lightning_pose.features import LocalExtractor
 from lightning_pose.sweeps.space import BASE, Config, Parameter, Settings, name_classes, suggest_name
@@ -42,19 +42,20 @@ class ParsedConfig(PoseCLI):
         return self.parser.parse_args(["--config", str(base), *write_options(settings)]).as_dict()
 
 
-def open_keypoint_data(config: ParsedConfig) -> tuple[Any, list[Path]]:
+def open_keypoint_data(config: ParsedConfig) -> tuple[SceneDataModule, LocalExtractor, list[Path]]:
     """Build a config's data module; its model and trainer are not built.
 
     Returns:
-        The data module, whose extractor is a `LocalExtractor`, and the files of the training frames.
+        The data module, its extractor, and the files of the training frames.
 
     Raises:
         ConfigError: the extractor finds no keypoints.
     """
     data = config.parser.instantiate_classes(config.config)["data"]
+    assert isinstance(data, SceneDataModule)
     if not isinstance(data.extractor, LocalExtractor):
         raise ConfigError(f"{data.extractor.name} finds no keypoints; give an extractor that does, such as SURF")
-    return data, [Path(data.scene.frames[i].image) for i in data.scene.splits["train"]]
+    return data, data.extractor, [Path(data.scene.frames[i].image) for i in data.scene.splits["train"]]
 
 
 def read_yaml(file: Path, what: str) -> Config:
@@ -164,7 +165,7 @@ def write_options(values: Settings) -> list[str]:
     ]
 
 
-def change_value(config: Config, full: Settings, parts: Sequence[str], value: Any) -> None:
+def change_value(config: Config, full: Settings, parts: Sequence[str], value: object) -> None:
     """Set one value in a config file's content, in `init_args` wherever the whole config `full` has them."""
     head, *rest = parts
     if "init_args" in full and head != "class_path":

@@ -6,7 +6,6 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from lightning_pose.errors import ConfigError
 from lightning_pose.metrics import catalog
@@ -75,7 +74,7 @@ class Plan:
     settings: Settings
     space: tuple[Parameter, ...]
     measure: str | None
-    figure: Any
+    figure: object
     resolved: Settings
 
     @property
@@ -84,7 +83,7 @@ class Plan:
         data = self.resolved["data"]["init_args"]
         searched = [p.example() for p in self.space if p.key == "data.root"]
         roots = [data["root"]] if data.get("root") else data.get("train_scenes") or []
-        return "+".join(Path(root).name for root in (searched[0] if searched else roots) if root) or "room"
+        return "+".join(Path(str(root)).name for root in (searched[0] if searched else roots) if root) or "room"
 
     @property
     def system(self) -> str:

@@ -7,8 +7,9 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
+import numpy as np
 import yaml
 from optuna import Study
 from optuna.trial import FrozenTrial, TrialState
@@ -30,6 +31,12 @@ __all__ = [
     "plan_figures",
     "write_best",
 ]
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    Drawn = Axes | np.ndarray
+    """What Optuna's figures return: one axes, or an array of them."""
 
 SHOWN = 10
 
@@ -114,19 +121,21 @@ def draw_figures(study: Study, plan: Plan, folder: Path) -> list[Path]:
             except (ValueError, RuntimeError, ImportError):
                 plt.close("all")
                 continue
-        axes = drawn.flat[0] if hasattr(drawn, "flat") else drawn
+        axes = drawn.flat[0] if isinstance(drawn, np.ndarray) else drawn
         file = folder / f"{name}.png"
-        axes.figure.savefig(file, dpi=120, bbox_inches="tight")
+        figure = axes.get_figure(root=True)
+        assert figure is not None, "Optuna draws into one"
+        figure.savefig(file, dpi=120, bbox_inches="tight")
         plt.close("all")
         files.append(file)
     return files
 
 
-def plan_figures(study: Study, objectives: Sequence[Objective]) -> Iterator[tuple[str, Callable[[], Any]]]:
+def plan_figures(study: Study, objectives: Sequence[Objective]) -> Iterator[tuple[str, Callable[[], Drawn]]]:
     """Optuna's figures of a study: the name of each, and a function that draws it."""
     from optuna.visualization import matplotlib as draw
 
-    kinds: dict[str, Callable[..., Any]] = {
+    kinds: dict[str, Callable[..., Drawn]] = {
         "history": draw.plot_optimization_history,
         "slice": draw.plot_slice,
         "parallel_coordinate": draw.plot_parallel_coordinate,

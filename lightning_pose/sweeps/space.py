@@ -6,6 +6,7 @@ import itertools
 import json
 import math
 from collections.abc import Container, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
@@ -66,14 +67,14 @@ class Parameter:
     high: float = 0
     step: float | None = None
     log: bool = False
-    choices: Mapping[Scalar, Any] | None = None
-    when: Mapping[str, tuple[Any, ...]] = field(default_factory=dict)
+    choices: Mapping[Scalar, object] | None = None
+    when: Mapping[str, tuple[object, ...]] = field(default_factory=dict)
 
     def active(self, values: Settings) -> bool:
         """Whether it is searched, given the values of the parameters before it."""
         return all(key in values and values[key] in wanted for key, wanted in self.when.items())
 
-    def draw(self, trial: Trial) -> Any:
+    def draw(self, trial: Trial) -> object:
         """A value that Optuna suggests, as the config has it."""
         if self.choices is not None:
             return self.choices[trial.suggest_categorical(self.key, list(self.choices))]
@@ -93,17 +94,19 @@ class Parameter:
             raise ConfigError(f"{self.key} has no step, so a grid has no end; give it a step, or choices")
         step = self.step or 1
         values = [self.low + i * step for i in range(math.floor((self.high - self.low) / step + 1e-9) + 1)]
-        return [int(value) if self.kind == "int" else self.value(float(value)) for value in values]
+        return [int(value) if self.kind == "int" else self._round_to_step(value) for value in values]
 
-    def value(self, label: Scalar) -> Any:
+    def value(self, label: Scalar) -> object:
         """The config's value of a label that Optuna stores."""
         if self.choices is not None:
             return self.choices[label]
-        if self.step is None or not isinstance(label, float):
-            return label
-        return min(float(f"{label:.12g}"), self.high)  # 0.1 + 0.1 + 0.1 is a little more than 0.3
+        return self._round_to_step(label) if self.step is not None and isinstance(label, float) else label
 
-    def example(self) -> list[Any]:
+    def _round_to_step(self, number: float) -> float:
+        """Undo what adding steps rounds: 0.1 + 0.1 + 0.1 is a little more than 0.3."""
+        return min(float(f"{number:.12g}"), self.high)
+
+    def example(self) -> list[object]:
         """Values to try against the config: all choices, or both ends."""
         if self.choices is not None:
             return list(self.choices.values())
@@ -156,34 +159,32 @@ def _parse_parameter(key: str, entry: object) -> Parameter:
     return _parse_range(key, kind, entry, when)
 
 
-def _parse_range(key: str, kind: str, entry: Settings, when: Mapping[str, tuple[Any, ...]]) -> Parameter:
-    whole = int if kind == "int" else (int, float)
-    numbers = {name: _read_number(entry.get(name)) for name in ("low", "high", "step")}
-    for name, number in numbers.items():
-        if name == "step" and number is None:
-            continue
-        if isinstance(number, bool) or not isinstance(number, whole) or not math.isfinite(number):
-            raise ConfigError(f"space.{key} has {name} {number!r}; give a {'whole ' * (kind == 'int')}number")
-    low, high, step, log = numbers["low"], numbers["high"], numbers["step"], bool(entry.get("log", False))
+def _parse_range(key: str, kind: str, entry: Settings, when: Mapping[str, tuple[object, ...]]) -> Parameter:
+    low, high = (_read_number(key, kind, name, entry.get(name)) for name in ("low", "high"))
+    step = None if entry.get("step") is None else _read_number(key, kind, "step", entry["step"])
+    log = bool(entry.get("log", False))
     if low > high:
         raise ConfigError(f"space.{key} has low {low} above high {high}; exchange them")
     if step is not None and step <= 0:
         raise ConfigError(f"space.{key} has step {step}; give a number above 0")
     if log and (low <= 0 or step is not None):
         raise ConfigError(f"space.{key} has log with low {low} and step {step}; give a low above 0 and no step")
-    as_kind = int if kind == "int" else float
-    return Parameter(key, kind, as_kind(low), as_kind(high), None if step is None else as_kind(step), log, when=when)
+    return Parameter(key, kind, low, high, step, log, when=when)
 
 
-def _read_number(value: Any) -> Any:
-    """A number, also where YAML 1.1 reads it as text, as 1e-4; anything else as it is."""
-    try:
-        return float(value) if isinstance(value, str) else value
-    except ValueError:
-        return value
+def _read_number(key: str, kind: str, name: str, value: object) -> float:
+    """A number of a range, also where YAML 1.1 reads it as text, as 1e-4."""
+    number = value
+    if isinstance(value, str):
+        with suppress(ValueError):
+            number = float(value)
+    whole = kind == "int"
+    if isinstance(number, bool) or not isinstance(number, int if whole else int | float) or not math.isfinite(number):
+        raise ConfigError(f"space.{key} has {name} {number!r}; give a {'whole ' * whole}number")
+    return number if whole else float(number)
 
 
-def _parse_when(key: str, when: object) -> dict[str, tuple[Any, ...]]:
+def _parse_when(key: str, when: object) -> dict[str, tuple[object, ...]]:
     if when is None:
         return {}
     if not isinstance(when, Mapping):

@@ -8,11 +8,10 @@ import sys
 import time
 import warnings
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import optuna
 from optuna import Study
@@ -21,6 +20,7 @@ from optuna.storages import RDBStorage
 from optuna.trial import FrozenTrial
 from sqlalchemy import create_engine, event, func, select
 from sqlalchemy.engine import URL, Dialect, Engine, make_url
+from sqlalchemy.engine.interfaces import DBAPIConnection
 from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 
 from lightning_pose.errors import ConfigError
@@ -99,7 +99,7 @@ def _parse_address(url: str) -> URL:
     return address
 
 
-def _engine_options(address: URL) -> dict[str, Any]:
+def _engine_options(address: URL) -> dict[str, object]:
     """SQLAlchemy's options: how long to wait for other writers of a file, or for a server's answer.
 
     A server's connections are tested before use, and replaced where the server has closed them.
@@ -111,7 +111,9 @@ def _engine_options(address: URL) -> dict[str, Any]:
     return {"pool_pre_ping": True, "pool_size": 1, "max_overflow": 9, "connect_args": connect}
 
 
-def _connect_patiently(dialect: Dialect, record: object, args: Any, kwargs: Any) -> Any:
+def _connect_patiently(
+    dialect: Dialect, record: object, args: Sequence[object], kwargs: Mapping[str, object]
+) -> DBAPIConnection:
     """Make one connection, repeatedly for two minutes while the server is out of reach.
 
     Optuna itself gives up at once, which would end a training run of hours because a server restarts.

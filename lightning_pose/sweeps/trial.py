@@ -197,8 +197,8 @@ def run_trial(trial: Trial, plan: Plan, parent: str) -> list[float]:
 
 def _measure_features(record: _TrialRecord, run: str, values: Settings) -> list[float]:
     """Measure keypoints instead of training."""
-    data, images = open_keypoint_data(ParsedConfig(record.plan.arguments(values)))
-    metrics, curves = measure_keypoints(data.cache, images, data.extractor.n_features)
+    data, extractor, images = open_keypoint_data(ParsedConfig(record.plan.arguments(values)))
+    metrics, curves = measure_keypoints(data.cache, images, extractor.n_features)
     for name, curve in (*((name, {0: value}) for name, value in metrics.items()), *curves.items()):
         for number, value in curve.items():
             record.client.log_metric(run, name, value, step=number)

@@ -59,7 +59,7 @@ def test_max_time_ends_training(workplace: Workplace) -> None:
 
 
 def test_the_profiler_reports(workplace: Workplace) -> None:
-    process = workplace.start("fit", "--config", workplace.config, "--trainer.profiler", "simple")
+    process = workplace.fork("fit", "--config", workplace.config, "--trainer.profiler", "simple")
     _, stderr = process.communicate(timeout=200)
     assert process.returncode == 0, stderr
     assert "Profiler Report" in stderr

@@ -6,8 +6,6 @@ import os
 import shutil
 import socket
 import sqlite3
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import closing
@@ -19,21 +17,19 @@ from mlflow import MlflowClient
 from lightning_pose.errors import ConfigError
 from lightning_pose.runs.logger import MLflowLogger
 from lightning_pose.runs.store import prepare_store
-from tests.helpers import REPOSITORY, Workplace
-
-OPEN = """
-import sys
-from lightning_pose.runs.logger import MLflowLogger
-logger = MLflowLogger()
-logger.client.set_tag(str(logger.run_id), "opened", "yes")
-logger.finalize("success")
-"""
+from tests.helpers import Workplace
+from tests.processes import ForkedProcess
 
 
-def start(folder: Path) -> subprocess.Popen[bytes]:
-    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
-    environment.pop("MLFLOW_TRACKING_URI", None)
-    return subprocess.Popen([sys.executable, "-c", OPEN], cwd=folder, env=environment)
+def open_store() -> None:
+    """Make a run in the store of the current folder."""
+    logger = MLflowLogger()
+    logger.client.set_tag(str(logger.run_id), "opened", "yes")
+    logger.finalize("success")
+
+
+def start(folder: Path) -> ForkedProcess:
+    return ForkedProcess(open_store, folder=folder, environment={})
 
 
 def read_statuses(folder: Path) -> list[str]:

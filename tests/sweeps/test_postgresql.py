@@ -61,7 +61,7 @@ def trials(database: str) -> list[FrozenTrial]:
 
 
 def test_commands_share_a_study_and_another_goes_on(workplace: Workplace, sweep: list[str], database: str) -> None:
-    commands = [workplace.start(*sweep[:-1], "2") for _ in range(2)]
+    commands = [workplace.fork(*sweep[:-1], "2") for _ in range(2)]
     for command in commands:
         _, errors = command.communicate(timeout=200)
         assert command.returncode == 0, errors
@@ -79,7 +79,7 @@ def test_a_killed_command_s_trial_is_run_by_the_next(
 ) -> None:
     killer = {"class_path": "tests.helpers.KillOnce", "init_args": {"marker": str(workplace.folder / "killed")}}
     sweep = [*sweep, "--trainer.callbacks", json.dumps([killer])]
-    with workplace.start(*sweep) as command:
+    with workplace.fork(*sweep) as command:
         _, errors = command.communicate(timeout=200)
     assert command.returncode == -signal.SIGKILL, errors
     assert [trial.state for trial in trials(database)] == [TrialState.RUNNING]

@@ -52,7 +52,7 @@ def load(workplace: Workplace) -> optuna.Study:
 def test_two_commands_run_each_grid_point_once(workplace: Workplace) -> None:
     units = [4, 5, 6, 7]
     file = write(workplace, sampler="grid", space={"model.units": units})
-    for command in [workplace.start("sweep", file) for _ in range(2)]:
+    for command in [workplace.fork("sweep", file) for _ in range(2)]:
         _, errors = command.communicate(timeout=200)
         assert command.returncode == 0, errors
     trials = load(workplace).trials
