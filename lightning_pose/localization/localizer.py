@@ -11,9 +11,12 @@ import torch
 
 from lightning_pose.checkpoint import build_object, check_specs, read_checkpoint
 from lightning_pose.errors import CheckpointError
-from lightning_pose.features.base import FeatureExtractor
+from lightning_pose.features.base import FeatureExtractor, Record
 from lightning_pose.geometry.relative import RelativeFrame
 from lightning_pose.localization.sequences import locate_sequence
+from lightning_pose.models.parts.answers import Answers, answer_by_network
+from lightning_pose.models.parts.poses import Pose
+from lightning_pose.scenes.images import to_gray
 
 if TYPE_CHECKING:
     from lightning_pose.models import PoseModule
@@ -79,17 +82,31 @@ class Localizer:
         Raises:
             ImageError: an image cannot be read.
         """
+        answers = self.locate(images)
+        return answers.position_m, answers.quat_wxyz
+
+    def locate(self, images: str | Path | np.ndarray | Sequence[str | Path | np.ndarray]) -> Answers:
+        """As a call, and say of each pose what it comes from, and how sure it is."""
         extractor, axes = self.extractor, 2 if self.extractor.color == "gray" else 3
         if isinstance(images, str | Path) or (isinstance(images, np.ndarray) and images.ndim == axes):
             images = [images]
         arrays = [image if isinstance(image, np.ndarray) else extractor.read(image) for image in images]
         if not arrays:
-            return np.zeros((0, 3), np.float32), np.zeros((0, 4), np.float32)
+            return answer_by_network(Pose(torch.zeros(0, 3), torch.zeros(0, 4)))
         records = extractor.extract(arrays)
-        features = torch.from_numpy(np.stack([extractor.features(record) for record in records]))
+        features = _stack_features(extractor, records)
         if self.clips is not None:
-            chained = locate_sequence(self.model, features, *self.clips)
-            return chained[0].numpy(), chained[1].numpy()
+            return answer_by_network(Pose(*locate_sequence(self.model, features, *self.clips)[:2]))
+        keypoints = None
+        if self.model.refinement is not None:
+            of_map = self.model.refinement.extractor
+            if not of_map.shares_records(extractor):
+                records = of_map.extract([to_gray(array) for array in arrays])
+            keypoints = _stack_features(of_map, records)
         with torch.inference_mode():
-            pose = self.model(features)
-        return pose.position_m.numpy(), pose.quat_wxyz.numpy()
+            return self.model.locate_images(features, keypoints)
+
+
+def _stack_features(extractor: FeatureExtractor, records: Sequence[Record]) -> torch.Tensor:
+    """(M, *feature_shape) of M records."""
+    return torch.from_numpy(np.stack([extractor.features(record) for record in records]))

@@ -83,7 +83,11 @@ def test_answers_are_accepted_with_a_radius_or_refused_with_a_reason(fitted: tup
 
 def test_a_test_says_what_the_map_accepts_and_how_well_it_knows(fitted: tuple[LandmarkMap, WallProblem]) -> None:
     model, problem = fitted
-    found = evaluate_map(model, problem.scene, problem.dataset("test").data)
+    data = problem.dataset("test").data
+    answers = model.network.locate(data.features)
+    found = evaluate_map(
+        model.network, answers, model.world_frame, model(data.features), problem.scene, data, "LandmarkMap"
+    )
     assert found.metrics.keys() == {f"test/{name}" for name in catalog.MAP}
     assert found.metrics["test/accepted"] == 1.0
     assert found.metrics["test/coverage_position"] > 0.6
