@@ -72,7 +72,7 @@ def evaluate_images(trainer: Trainer, module: PoseModule, located: Located, mode
 def _evaluate_map(module: PoseModule, prediction: Pose, scene: Scene, test: PoseBatch) -> MapEvaluation:
     """What only a map has, or a system with one beside it; empty for others."""
     if isinstance(module, LandmarkMap):
-        answers = module.network.locate(test.features)
+        answers = module.locate_frames(test)
         return evaluate_map(module.network, answers, module.world_frame, prediction, scene, test, module.system_name)
     refinement = module.refinement
     if refinement is None or not refinement.has_map:

@@ -54,6 +54,7 @@ class PoseModule(RefinedModule, StandardizedModule):
     | `reduced_shape` | seldom | the shape of a frame's features once a fixed projection has reduced them |
     | `training_splits` | seldom | the splits whose poses end up in the weights |
     | `memory` | seldom | with `TrainingMemory`: what the checkpoint carries of every training frame |
+    | `locate_images` | seldom | answers for images whose size, and perhaps camera, are known |
     | `reads_clips`, `check_data`, `training_poses`, `select_judged` | for clips | see `ClipModule` |
 
     With `standardize`, the seven numbers are in standard deviations around the mean training pose; otherwise they are

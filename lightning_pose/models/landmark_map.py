@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, ClassVar, cast
 
 import torch
@@ -11,11 +12,15 @@ from torch import Tensor
 from lightning_pose.data.batches import PoseBatch
 from lightning_pose.data.datamodule import SceneDataModule, scene_datamodule
 from lightning_pose.geometry.camera import Camera
+from lightning_pose.geometry.quaternions import quat_normalize
+from lightning_pose.mapping.map_localizer import MapAnswer
 from lightning_pose.models.base import PoseModule
 from lightning_pose.models.parts.answers import Answers, answer_by_map, convert_answers
+from lightning_pose.models.parts.frame_cameras import list_cameras, scale_cameras
 from lightning_pose.models.parts.map_builder import BundleAdjust, MapBuilder, check_bundle_adjust, check_keypoints
 from lightning_pose.models.parts.map_network import MAP_SHAPES, MapNetwork
 from lightning_pose.models.parts.memory import TrainingMemory
+from lightning_pose.models.parts.poses import Located
 
 __all__ = ["LandmarkMap"]
 
@@ -26,10 +31,10 @@ class LandmarkMap(TrainingMemory, PoseModule):
     Not in the thesis: its features are those of SurfCNN and SurfLSTM with their places in the image. One pass over
     the training frames builds the map; there is nothing to train in steps.
 
+    Each frame has its own camera: the dataset's, or `data.camera`. Where none is known, all have the focal length that
+    fits the training poses best.
+
     Args:
-        camera: `MODEL,WIDTH,HEIGHT,PARAMETERS...` in COLMAP's notation, such as `PINHOLE,640,480,525,525,320,240`, for
-            images that carry none; the centre of the first pixel is (0, 0). Without it, the dataset's camera is used,
-            and if it has none, the focal length that fits the poses best.
         bundle_adjust: `true` moves the training poses until they agree with the images, and carries answers back to
             the given poses; `auto` does so if validation frames (without them, training frames left out in turn) are
             located better; `false` takes the poses as they are.
@@ -38,8 +43,8 @@ class LandmarkMap(TrainingMemory, PoseModule):
         **kwargs: what `PoseModule` takes. `loss` is only logged; learning rate, decay and schedule are ignored.
 
     Raises:
-        ConfigError: `camera` or `bundle_adjust` is not understood; in `setup`, the features are not keypoints
-            with their geometry.
+        ConfigError: `bundle_adjust` is not understood; in `setup`, the features are not keypoints with their
+            geometry.
     """
 
     input_ranks: ClassVar[tuple[int, ...]] = (2,)
@@ -49,7 +54,6 @@ class LandmarkMap(TrainingMemory, PoseModule):
 
     def __init__(
         self,
-        camera: str | None = None,
         bundle_adjust: BundleAdjust = "auto",
         refit: bool = True,
         standardize: bool = False,
@@ -58,7 +62,6 @@ class LandmarkMap(TrainingMemory, PoseModule):
     ) -> None:
         super().__init__(standardize=standardize, standardize_features=standardize_features, **kwargs)
         self.automatic_optimization = False
-        self.camera = None if camera is None else Camera.parse(camera)
         check_bundle_adjust(bundle_adjust)
         self.bundle_adjust: BundleAdjust = bundle_adjust
         self.refit = refit
@@ -100,11 +103,6 @@ class LandmarkMap(TrainingMemory, PoseModule):
         super().on_train_epoch_end()
         self.trainer.should_stop = True  # further epochs would find the same
 
-    def locate_images(self, features: Tensor, keypoints: Tensor | None = None) -> Answers:
-        """As any system, with the reason where the map refuses; `keypoints` are the features themselves."""
-        found = self.network.locate(features)
-        return answer_by_map(convert_answers(found, self.world_frame), found, self.network, self.world_frame.scale)
-
     @property
     def _refits(self) -> bool:
         """Whether the map is built again with validation frames."""
@@ -112,4 +110,33 @@ class LandmarkMap(TrainingMemory, PoseModule):
 
     def _make_builder(self) -> MapBuilder:
         datamodule = scene_datamodule(self.trainer)
-        return MapBuilder(self.network, datamodule, self.world_frame, self.bundle_adjust, self.camera, self.print)
+        return MapBuilder(self.network, datamodule, self.world_frame, self.bundle_adjust, self.print)
+
+    def decode_batch(self, batch: PoseBatch) -> tuple[Tensor, Tensor]:
+        """As `decode_features`, each frame with its own camera."""
+        features = self.standardize_input(batch.features)
+        return self.unscale_pose(self.network(features, self._list_cameras(batch.frame)))
+
+    def predict_step(self, batch: PoseBatch, batch_idx: int) -> Located:
+        position, quat = self.decode_batch(batch)
+        return Located(batch.frame, self.world_frame.to_world(position), quat_normalize(quat))
+
+    def locate_frames(self, batch: PoseBatch) -> list[MapAnswer]:
+        """What the map says of frames of the trainer's data module, in the map's own unit."""
+        return self.network.locate(batch.features, self._list_cameras(batch.frame))
+
+    def locate_images(
+        self,
+        features: Tensor,
+        sizes: Sequence[tuple[int, int]],
+        camera: Camera | None = None,
+        keypoints: Tensor | None = None,
+    ) -> Answers:
+        """As any system, with the reason where the map refuses; `keypoints` are the features themselves."""
+        cameras = scale_cameras(self.network.view if camera is None else camera, sizes)
+        found = self.network.locate(features, cameras)
+        return answer_by_map(convert_answers(found, self.world_frame), found, self.network, self.world_frame.scale)
+
+    def _list_cameras(self, frames: Tensor) -> list[Camera]:
+        """The cameras of frames of the trainer's data module; those of unknown ones are the map's."""
+        return list_cameras(scene_datamodule(self.trainer), frames.tolist(), self.network.view)

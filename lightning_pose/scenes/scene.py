@@ -23,7 +23,8 @@ class Intrinsics:
         cx: principal point.
         cy: principal point.
         size: width and height of the images that the numbers are for; None for the images as they are.
-        distortion: OpenCV's coefficients k1 k2 p1 p2 k3 ...; empty for none.
+        distortion: OpenCV's coefficients k1 k2 p1 p2 k3 ..., or with `fisheye` k1 k2 k3 k4; empty for none.
+        fisheye: whether the distortion is that of a fisheye lens (equidistant).
     """
 
     fx: float
@@ -32,6 +33,7 @@ class Intrinsics:
     cy: float
     size: tuple[int, int] | None = None
     distortion: tuple[float, ...] = ()
+    fisheye: bool = False
 
     def for_size(self, width: int, height: int) -> Intrinsics:
         """The same camera for images that were resized to this size."""
@@ -39,7 +41,7 @@ class Intrinsics:
             return self
         x, y = width / self.size[0], height / self.size[1]
         cx, cy = (self.cx + 0.5) * x - 0.5, (self.cy + 0.5) * y - 0.5
-        return Intrinsics(self.fx * x, self.fy * y, cx, cy, (width, height), self.distortion)
+        return Intrinsics(self.fx * x, self.fy * y, cx, cy, (width, height), self.distortion, self.fisheye)
 
 
 @dataclass(frozen=True)

@@ -117,7 +117,8 @@ def test_one_checkpoint_holds_both(refined: tuple[PoseModule, RefinableProblem, 
     rebuilt.load_state_dict(model.state_dict())
     features = problem.dataset("test").data.features
     keypoints = problem.with_extractor(rebuilt.refinement.extractor).dataset("test").data.features  # type: ignore[union-attr]
-    ours, theirs = (each.eval().locate_images(features, keypoints) for each in (model, rebuilt))
+    sizes = [(640, 480)] * len(features)
+    ours, theirs = (each.eval().locate_images(features, sizes, keypoints=keypoints) for each in (model, rebuilt))
     np.testing.assert_array_equal(ours.position_m, theirs.position_m)
     assert theirs.source == ("network",) * BLANK + ("map",) * (24 - BLANK)
     assert theirs.reason == ("too few features: 0",) * BLANK + ("",) * (24 - BLANK)

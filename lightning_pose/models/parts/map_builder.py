@@ -19,6 +19,7 @@ from lightning_pose.mapping.conventions import fit_focal_length
 from lightning_pose.mapping.frame_matches import match_nearby_frames
 from lightning_pose.mapping.frames import MapFrames
 from lightning_pose.mapping.map_localizer import MapLocalizer
+from lightning_pose.models.parts.frame_cameras import find_frequent_camera, list_cameras
 from lightning_pose.models.parts.map_network import MapNetwork, keypoints_to_frames
 from lightning_pose.models.parts.world_frame import WorldFrame
 
@@ -51,7 +52,6 @@ class MapBuilder:
         datamodule: its features are keypoints with their places.
         world_frame: of the map's positions.
         bundle_adjust: as for `LandmarkMap`; what `auto` finds holds for further maps.
-        camera: of images that carry none.
         say: takes lines for the user.
     """
 
@@ -61,17 +61,15 @@ class MapBuilder:
         datamodule: SceneDataModule,
         world_frame: WorldFrame,
         bundle_adjust: BundleAdjust,
-        camera: Camera | None,
         say: Callable[[str], None],
     ) -> None:
         self.network = network
         self.datamodule = datamodule
         self.world_frame = world_frame
         self.bundle_adjust = bundle_adjust
-        self.camera = camera
         self.say = say
         self._adjusts = bundle_adjust is True
-        self._found: Camera | None = None
+        self._camera: Camera | None = None
 
     def build(self, splits: tuple[str, ...], calibrate: bool) -> None:
         """Build the map of the frames of these splits; unless it is only to be validated, find its radii too.
@@ -118,7 +116,10 @@ class MapBuilder:
         return adjusted if self._adjusts else mapped
 
     def _read_frames(self, splits: tuple[str, ...], camera: Camera) -> MapFrames:
-        """Keypoints and given poses of the frames of these splits, in the order of the scene."""
+        """Keypoints and given poses of the frames of these splits, in the order of the scene.
+
+        `camera` is that of frames whose own is unknown.
+        """
         data = [self.datamodule.dataset(split).data for split in splits]
         index = torch.cat([part.frame for part in data])
         order = index.argsort()
@@ -126,26 +127,29 @@ class MapBuilder:
         quats = np.array([frame.quat_wxyz for frame in frames])
         return keypoints_to_frames(
             torch.cat([part.features for part in data])[order],
-            camera,
+            list_cameras(self.datamodule, index[order].tolist(), camera),
             Rotation.from_quat(quats, scalar_first=True).as_matrix(),
             self.world_frame.to_local(torch.from_numpy(np.array([frame.position_m for frame in frames]))).numpy(),
         )
 
     def _find_camera(self) -> Camera:
-        """The camera of the setting, of the dataset, or with the focal length that fits the training poses."""
-        if self._found is None:
-            self._found = self._choose_camera()
-        return self._found
+        """The most frequent camera of the training frames, or one with the focal length that fits their poses."""
+        if self._camera is None:
+            frames = self.datamodule.scene.splits["train"].tolist()
+            camera, count = find_frequent_camera(self.datamodule, frames)
+            if count > 1:
+                self.say(f"{count} cameras; images that come without one are located as if by {camera}")
+            self._camera = self._fit_camera() if camera is None else camera
+        return self._camera
 
-    def _choose_camera(self) -> Camera:
+    def _fit_camera(self) -> Camera:
+        """The camera with the focal length that fits the training poses best.
+
+        Raises:
+            ConfigError: too few matches, or no motion.
+        """
         scene = self.datamodule.scene
-        first = scene.frames[int(scene.splits["train"][0])]
         width, height = self.datamodule.find_image_size("train")
-        if self.camera is not None:
-            return self.camera.resize(width, height)
-        if first.intrinsics is not None:
-            known = first.intrinsics.for_size(width, height)
-            return Camera(width, height, known.fx, known.fy, known.cx, known.cy, known.distortion)
         guess = Camera(width, height, 1.0, 1.0, (width - 1) / 2, (height - 1) / 2)
         frames = self._read_frames(("train",), guess)
         sequences = [scene.frames[i].sequence for i in self.datamodule.dataset("train").data.frame.tolist()]
@@ -157,10 +161,10 @@ class MapBuilder:
         if not np.isfinite(residual_px):
             raise ConfigError(
                 f"the camera of {scene.root} is unknown, and its frames do not tell the focal length (too few matches, "
-                "or no motion); give model.camera, such as PINHOLE,640,480,525,525,320,240"
+                "or no motion); give data.camera, such as PINHOLE,640,480,525,525,320,240"
             )
         self.say(
             f"the camera is unknown: a focal length of {focal_px:.0f} px fits the poses best (matches lie "
-            f"{residual_px:.2f} px off their epipolar lines); model.camera sets another"
+            f"{residual_px:.2f} px off their epipolar lines); data.camera sets another"
         )
         return Camera(width, height, focal_px, focal_px, (width - 1) / 2, (height - 1) / 2)

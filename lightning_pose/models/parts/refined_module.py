@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, ClassVar
 
@@ -12,8 +12,10 @@ from torch import Tensor
 
 from lightning_pose.data.datamodule import SceneDataModule, scene_datamodule
 from lightning_pose.errors import CheckpointError, ConfigError, DataError
+from lightning_pose.geometry.camera import Camera
 from lightning_pose.models.parts.answers import Answers, answer_by_map, answer_by_network, replace_accepted
 from lightning_pose.models.parts.checkpoint_hooks import CheckpointHooks
+from lightning_pose.models.parts.frame_cameras import scale_cameras
 from lightning_pose.models.parts.poses import Pose
 from lightning_pose.models.parts.refinement import MapRefinement, MapSettings
 from lightning_pose.models.parts.world_frame import WorldFrame
@@ -100,22 +102,34 @@ class RefinedModule(CheckpointHooks):
             return pose
         return replace_accepted(pose, self.refinement.locate_frames(frame.tolist()), self.world_frame)
 
-    def locate_images(self, features: Tensor, keypoints: Tensor | None = None) -> Answers:
-        """Answers for images from anywhere.
+    def locate_images(
+        self,
+        features: Tensor,
+        sizes: Sequence[tuple[int, int]],
+        camera: Camera | None = None,
+        keypoints: Tensor | None = None,
+    ) -> Answers:
+        """Answers for images from anywhere, as a `Localizer` has them.
 
         Args:
             features: (B, *input_shape).
+            sizes: width and height of each image, in pixels; only maps use them.
+            camera: of all images, scaled to each; that of the training images if None.
             keypoints: (B, N, D + 4) of the same images, by the extractor of `refinement`, where there is one.
+
+        Raises:
+            ConfigError: a camera is given, and there is no map that reads it; or it is for images of another shape.
         """
+        if self.refinement is None and camera is not None:
+            raise ConfigError(f"{type(self).__name__} does not use cameras; leave camera out")
         pose: Pose = self(features)
         alone = answer_by_network(pose)
-        if self.refinement is None or keypoints is None:
+        if self.refinement is None or not self.refinement.has_map or keypoints is None:
             return alone
         network = self.refinement.network
-        found = network.locate(keypoints)
-        return answer_by_map(
-            replace_accepted(pose, found, self.world_frame), found, network, self.world_frame.scale, alone
-        )
+        found = network.locate(keypoints, scale_cameras(network.view if camera is None else camera, sizes))
+        refined = replace_accepted(pose, found, self.world_frame)
+        return answer_by_map(refined, found, network, self.world_frame.scale, alone)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Give the map the checkpoint's size; without `refine`, leave the checkpoint's map out.

@@ -12,6 +12,7 @@ from lightning_pose.data.datamodule import SceneDataModule
 from lightning_pose.errors import ConfigError
 from lightning_pose.features import BRIEF, FREAK, ORB, SIFT, SURF, LocalExtractor
 from lightning_pose.mapping.map_localizer import MapAnswer
+from lightning_pose.models.parts.frame_cameras import list_cameras
 from lightning_pose.models.parts.map_builder import BundleAdjust, MapBuilder, check_bundle_adjust
 from lightning_pose.models.parts.map_network import MAP_SHAPES, MapNetwork
 from lightning_pose.models.parts.memory import resize_tensors
@@ -88,7 +89,7 @@ class MapRefinement(nn.Module):
         """
         self._keypoints = datamodule.with_extractor(self.extractor)
         self._answers = {}
-        self._builder = MapBuilder(self.network, self._keypoints, world_frame, self.settings.bundle_adjust, None, say)
+        self._builder = MapBuilder(self.network, self._keypoints, world_frame, self.settings.bundle_adjust, say)
 
     def fit(self, splits: tuple[str, ...], calibrate: bool) -> None:
         """Build the map of the frames of these splits; `calibrate` finds the radii of its answers too."""
@@ -103,9 +104,11 @@ class MapRefinement(nn.Module):
 
     def locate_frames(self, frames: Sequence[int]) -> list[MapAnswer]:
         """The map's answers for frames of the data module; it is asked once for each."""
+        assert self._keypoints is not None, "attach comes first"
         new = [frame for frame in dict.fromkeys(frames) if frame not in self._answers]
         if new:
-            self._answers |= zip(new, self.network.locate(self.read_keypoints(new)), strict=True)
+            cameras = list_cameras(self._keypoints, new, self.network.view)
+            self._answers |= zip(new, self.network.locate(self.read_keypoints(new), cameras), strict=True)
         return [self._answers[frame] for frame in frames]
 
     def resize_map(self, state_dict: Mapping[str, Tensor]) -> None:
