@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Sequence
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
@@ -111,6 +113,17 @@ class SceneDataModule(LightningDataModule):
         if split not in self._datasets:
             self._datasets[split] = self._make_dataset(split, self._read(split, self.cache))
         return self._datasets[split]
+
+    def with_extractor(self, extractor: FeatureExtractor) -> SceneDataModule:
+        """The same scene, splits and cache folder with another extractor's features."""
+        other = copy(self)
+        other._scene, other._datasets = self.scene, {}
+        other.extractor, other.cache = extractor, FeatureCache(extractor, self.cache_dir)
+        return other
+
+    def read_features(self, frames: Sequence[int]) -> torch.Tensor:
+        """(M, *input_shape) features of any frames, indices into `Scene.frames`."""
+        return torch.from_numpy(self.cache.features([self.scene.frames[i].image for i in frames], self.workers))
 
     def find_image_size(self, split: str) -> tuple[int, int]:
         """Width and height of the first image of a split."""

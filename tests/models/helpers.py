@@ -16,7 +16,7 @@ from lightning_pose import models
 from lightning_pose.data import ClipDataModule, SceneDataModule
 from lightning_pose.data.batches import PoseBatch, PoseDataset, make_loader
 from lightning_pose.data.clip_dataset import ClipDataset, ClipShape
-from lightning_pose.features import SURF
+from lightning_pose.features import SURF, FeatureExtractor
 from lightning_pose.geometry.camera import Camera
 from lightning_pose.mapping.frames import MapFrames
 from lightning_pose.models import PoseModule
@@ -30,6 +30,7 @@ __all__ = [
     "WALL_CAMERA",
     "ClipProblem",
     "LearnableProblem",
+    "RefinableProblem",
     "SmallCNN",
     "WallProblem",
     "features_for",
@@ -210,6 +211,38 @@ class WallProblem(LearnableProblem):
 
     def measure_image(self, frame: int) -> tuple[int, int]:
         return self._sizes[frame]
+
+    def read_features(self, frames: Sequence[int]) -> torch.Tensor:
+        data = [self.splits[split].data for split in _SEEDS]
+        return torch.cat([part.features for part in data])[list(frames)]
+
+
+class RefinableProblem(WallProblem):
+    """Frames of a wall whose features are (D,) numbers that show the pose roughly, beside the wall's keypoints."""
+
+    def __init__(self, columns: int = 16, count: int = 24) -> None:
+        super().__init__([WALL_KEYPOINTS, 36], count)
+        self.keypoints = self.splits
+        mix = torch.randn(7, columns, generator=torch.Generator().manual_seed(1))
+        self.splits = {}
+        for split, frames in self.keypoints.items():
+            noise = 0.1 * torch.randn(count, columns, generator=torch.Generator().manual_seed(_SEEDS[split]))
+            features = torch.cat([frames.data.position_m, frames.data.quat_wxyz], dim=-1) @ mix + noise
+            self.splits[split] = PoseDataset(frames.data._replace(features=features))
+        self.data = self.splits["train"]
+        self.learnt = self.data.data
+        self.extractor = Thumbnails()
+
+    def with_extractor(self, extractor: FeatureExtractor) -> SceneDataModule:
+        """The wall's keypoints, with descriptors as wide as the extractor's."""
+        other = WallProblem([WALL_KEYPOINTS, 36])
+        other._scene, other.splits = self.scene, {}
+        for split, frames in self.keypoints.items():
+            descriptors, places = frames.data.features.split([32, 4], dim=-1)
+            wider = torch.zeros(*descriptors.shape[:2], extractor.feature_shape[1] - 36)
+            features = torch.cat([descriptors, wider, places], dim=-1)
+            other.splits[split] = PoseDataset(frames.data._replace(features=features))
+        return other
 
 
 def wall_features(wall: MapFrames, n: int, cameras: Sequence[Camera]) -> np.ndarray:

@@ -75,7 +75,7 @@ def test_images_of_another_size_are_located_as_well(fitted: tuple[LandmarkMap, W
         seen_by = str(Camera.parse(WALL_CAMERA).resize(width, height))
         data = WallProblem([WALL_KEYPOINTS, 36], count=30, cameras=[seen_by]).dataset("test").data
         pose = model.locate_images(data.features, [(width, height)] * 30)
-        errors.append(position_error_m(pose.position_m, data.position_m).median())
+        errors.append(position_error_m(torch.from_numpy(pose.position_m), data.position_m).median())
     assert max(errors) < 1.05 * errors[0]
 
 
@@ -84,7 +84,7 @@ def test_images_of_another_camera_need_it(fitted: tuple[LandmarkMap, WallProblem
     other = "SIMPLE_RADIAL,640,640,380,300,330,-0.1"
     data = WallProblem([WALL_KEYPOINTS, 36], count=30, cameras=[other]).dataset("test").data
     pose = model.locate_images(data.features, [(640, 640)] * 30, Camera.parse(other))
-    assert position_error_m(pose.position_m, data.position_m).median() < 0.01
+    assert position_error_m(torch.from_numpy(pose.position_m), data.position_m).median() < 0.01
     with pytest.raises(ConfigError, match=r"640x640 pixels, and its camera is for 640x480.*give camera for its own"):
         model.locate_images(data.features, [(640, 640)] * 30)
 
@@ -113,7 +113,11 @@ def test_answers_are_accepted_with_a_radius_or_refused_with_a_reason(fitted: tup
 
 def test_a_test_says_what_the_map_accepts_and_how_well_it_knows(fitted: tuple[LandmarkMap, WallProblem]) -> None:
     model, problem = fitted
-    found = evaluate_map(model, problem.scene, problem.dataset("test").data)
+    data = problem.dataset("test").data
+    answers = model.network.locate(data.features)
+    found = evaluate_map(
+        model.network, answers, model.world_frame, model(data.features), problem.scene, data, "LandmarkMap"
+    )
     assert found.metrics.keys() == {f"test/{name}" for name in catalog.MAP}
     assert found.metrics["test/accepted"] == 1.0
     assert found.metrics["test/coverage_position"] > 0.6

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from lightning_pose.data.datamodule import SceneDataModule
 from lightning_pose.geometry.camera import Camera
 from lightning_pose.scenes.cameras import scale_camera
 
-__all__ = ["find_frequent_camera", "list_cameras"]
+__all__ = ["find_frequent_camera", "list_cameras", "scale_cameras"]
 
 
 def list_cameras(datamodule: SceneDataModule, frames: Iterable[int], fallback: Camera) -> list[Camera]:
@@ -40,3 +40,12 @@ def find_frequent_camera(datamodule: SceneDataModule, frames: Iterable[int]) -> 
     most = max(known.values(), default=0)
     often = sorted((camera for camera in known if known[camera] == most), key=lambda camera: camera.focal_px)
     return (often[len(often) // 2] if often else None), len(known)
+
+
+def scale_cameras(camera: Camera, sizes: Sequence[tuple[int, int]]) -> list[Camera]:
+    """One camera for images of these widths and heights.
+
+    Raises:
+        ConfigError: an image has another shape than those that the camera is for.
+    """
+    return [scale_camera(camera, *size, setting="camera") for size in sizes]
