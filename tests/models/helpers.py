@@ -203,7 +203,7 @@ class WallProblem(LearnableProblem):
             image = Path("wall.png")
             frames += [Frame(image, c, q, split, i) for i, (c, q) in enumerate(zip(wall.position, quats, strict=True))]
             self._sizes += [(camera.width, camera.height) for camera in seen_by]
-            self._cameras |= {int(i): c and Camera.parse(c) for i, c in zip(frame, given, strict=True)}
+            self._cameras |= {int(i): Camera.parse(c) if c else None for i, c in zip(frame, given, strict=True)}
         self.data = self.splits["train"]
         self.learnt = self.data.data
         splits = {split: part.data.frame.numpy() for split, part in self.splits.items()}
