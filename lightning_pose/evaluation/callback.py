@@ -68,7 +68,8 @@ class TestReport(Callback):
         self.evaluation = found
         self.results = {pl_module.system_name: model, **found.rows, **found.baselines}
         scene = scene_datamodule(trainer).scene
-        print_results(self.results, f"{scene.name}, {pl_module.headline}", found.extras)
+        unit = "" if scene.unit == "m" else "; lengths are in the scene's own unit, not in metres"
+        print_results(self.results, f"{scene.name}, {pl_module.headline}{unit}", found.extras)
         logger = run_logger(trainer)
         if logger is None:
             return
