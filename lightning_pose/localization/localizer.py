@@ -13,6 +13,7 @@ from lightning_pose.checkpoint import build_object, check_specs, read_checkpoint
 from lightning_pose.errors import CheckpointError
 from lightning_pose.features.base import FeatureExtractor
 from lightning_pose.geometry.relative import RelativeFrame
+from lightning_pose.localization.inputs import read_images
 from lightning_pose.localization.sequences import locate_sequence
 
 if TYPE_CHECKING:
@@ -77,12 +78,10 @@ class Localizer:
             order, and the world is the first camera.
 
         Raises:
+            ConfigError: images are neither files nor such arrays.
             ImageError: an image cannot be read.
         """
-        extractor, axes = self.extractor, 2 if self.extractor.color == "gray" else 3
-        if isinstance(images, str | Path) or (isinstance(images, np.ndarray) and images.ndim == axes):
-            images = [images]
-        arrays = [image if isinstance(image, np.ndarray) else extractor.read(image) for image in images]
+        extractor, arrays = self.extractor, read_images(images, self.extractor)
         if not arrays:
             return np.zeros((0, 3), np.float32), np.zeros((0, 4), np.float32)
         records = extractor.extract(arrays)

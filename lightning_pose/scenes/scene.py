@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["SPLITS", "Frame", "Intrinsics", "Scene"]
+__all__ = ["SPLITS", "Frame", "Intrinsics", "Scene", "Trajectory"]
 
 SPLITS = ("train", "val", "test")
 
@@ -23,7 +24,8 @@ class Intrinsics:
         cx: principal point.
         cy: principal point.
         size: width and height of the images that the numbers are for; None for the images as they are.
-        distortion: OpenCV's coefficients k1 k2 p1 p2 k3 ...; empty for none.
+        distortion: OpenCV's coefficients k1 k2 p1 p2 k3 ..., or with `fisheye` k1 k2 k3 k4; empty for none.
+        fisheye: whether the distortion is that of a fisheye lens (equidistant).
     """
 
     fx: float
@@ -32,6 +34,7 @@ class Intrinsics:
     cy: float
     size: tuple[int, int] | None = None
     distortion: tuple[float, ...] = ()
+    fisheye: bool = False
 
     def for_size(self, width: int, height: int) -> Intrinsics:
         """The same camera for images that were resized to this size."""
@@ -39,7 +42,7 @@ class Intrinsics:
             return self
         x, y = width / self.size[0], height / self.size[1]
         cx, cy = (self.cx + 0.5) * x - 0.5, (self.cy + 0.5) * y - 0.5
-        return Intrinsics(self.fx * x, self.fy * y, cx, cy, (width, height), self.distortion)
+        return Intrinsics(self.fx * x, self.fy * y, cx, cy, (width, height), self.distortion, self.fisheye)
 
 
 @dataclass(frozen=True)
@@ -65,6 +68,20 @@ class Frame:
     intrinsics: Intrinsics | None = None
 
 
+class Trajectory(NamedTuple):
+    """Poses as a function of time, more or others than the images have; see `geometry.interpolation`.
+
+    Attributes:
+        times_s: (N,) on the clock of the poses, which should be that of the frames' timestamps; in any order.
+        positions_m: (N, 3), as those of frames.
+        quats_wxyz: (N, 4), as those of frames.
+    """
+
+    times_s: np.ndarray
+    positions_m: np.ndarray
+    quats_wxyz: np.ndarray
+
+
 @dataclass(frozen=True)
 class Scene:
     """Every frame of one place, and which frames are for training, validation and test.
@@ -81,6 +98,7 @@ class Scene:
         ground_truth: where the poses come from (`original`, `sfm`, `synthetic`, ...).
         bad_frames: what is wrong with each frame that the dataset lists and that is not in `frames`; each text begins
             with the file, and the line where there are several.
+        trajectory: all sound poses of the dataset, where it has them by time, whether or not a frame has their time.
     """
 
     name: str
@@ -92,3 +110,4 @@ class Scene:
     unit: str = "m"
     ground_truth: str = "original"
     bad_frames: tuple[str, ...] = ()
+    trajectory: Trajectory | None = None
