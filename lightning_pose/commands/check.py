@@ -20,6 +20,7 @@ from lightning_pose.scenes.inspect import (
     inspect_poses,
     read_image_files,
 )
+from lightning_pose.scenes.recording import describe_pose_camera, inspect_recording
 from lightning_pose.scenes.scene import SPLITS, Scene
 
 if TYPE_CHECKING:
@@ -49,11 +50,13 @@ def main(argv: list[str]) -> int:
     in_images, in_poses = inspect_images(scene, files), inspect_poses(scene)
     errors = _describe_drop(scene) + in_images.errors + in_poses.errors + compared.errors
     warnings = in_images.warnings + in_poses.warnings + compared.warnings
-    for kind, texts in (("error", errors), ("warning", warnings)):
+    warnings += inspect_recording(scene, [file.digest for file in files])
+    for kind, texts in (("error", errors), ("warning", warnings), ("note", describe_pose_camera(scene))):
         for text in texts:
             console.print(f"{kind}: {text}", markup=False, highlight=False, soft_wrap=True)
     if not errors:
-        console.print(f"{args.dir} is usable as it is", markup=False, highlight=False, soft_wrap=True)
+        noted = "usable as it is" if not warnings else "usable; mind the warnings above"
+        console.print(f"{args.dir} is {noted}", markup=False, highlight=False, soft_wrap=True)
     return 2 if errors else 0
 
 

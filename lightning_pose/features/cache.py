@@ -16,6 +16,7 @@ from lightning_pose.features.base import FeatureExtractor, Record
 from lightning_pose.features.fill_job import FillJob, ImagePath, Visit, count_cores, hash_bytes
 from lightning_pose.features.record_files import TEMPORARY, write_file_atomically
 from lightning_pose.paths import cache_folder
+from lightning_pose.scenes.images import DECODING_VERSION
 
 __all__ = ["FeatureCache", "FillReport"]
 
@@ -46,8 +47,8 @@ class FillReport:
 class FeatureCache:
     """An extractor's records on disk, one safetensors file per image, found by the image's content.
 
-    A file is keyed by the bytes of its image and by the extractor's name, version and settings:
-    `<root>/<name>-<settings>/<ab>/<content>.safetensors`; `settings.json` has the settings in full. A moved or
+    A file is keyed by the bytes of its image, the version of their decoding, and the extractor's name, version and
+    settings: `<root>/<name>-<settings>/<ab>/<content>.safetensors`; `settings.json` has the settings in full. A moved or
     renamed dataset is therefore still cached, and different settings have different folders. A process that is
     killed leaves no partial file; each file has a checksum, and a damaged file is written anew. Several processes may
     fill one cache at the same time and share the work.
@@ -68,6 +69,7 @@ class FeatureCache:
             "format": _FORMAT,
             "name": extractor.name,
             "version": extractor.version,
+            "decoding": DECODING_VERSION,
             "settings": dict(extractor.settings),
         }
         canonical = json.dumps(self._about, sort_keys=True, separators=(",", ":"))

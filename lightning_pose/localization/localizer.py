@@ -14,6 +14,7 @@ from lightning_pose.errors import CheckpointError, ConfigError
 from lightning_pose.features.base import FeatureExtractor, Record
 from lightning_pose.geometry.camera import Camera
 from lightning_pose.geometry.relative import RelativeFrame
+from lightning_pose.localization.inputs import read_images
 from lightning_pose.localization.sequences import locate_sequence
 from lightning_pose.models.parts.answers import Answers, answer_by_network
 from lightning_pose.models.parts.poses import Pose
@@ -85,7 +86,8 @@ class Localizer:
             order, and the world is the first camera.
 
         Raises:
-            ConfigError: the camera is not understood, not used, or for images of another shape.
+            ConfigError: images are neither files nor such arrays; or the camera is not understood, not used, or for
+                images of another shape.
             ImageError: an image cannot be read.
         """
         answers = self.locate(images, camera)
@@ -98,10 +100,7 @@ class Localizer:
     ) -> Answers:
         """As a call, and say of each pose what it comes from, and how sure it is."""
         camera = Camera.parse(camera) if isinstance(camera, str) else camera
-        extractor, axes = self.extractor, 2 if self.extractor.color == "gray" else 3
-        if isinstance(images, str | Path) or (isinstance(images, np.ndarray) and images.ndim == axes):
-            images = [images]
-        arrays = [image if isinstance(image, np.ndarray) else extractor.read(image) for image in images]
+        extractor, arrays = self.extractor, read_images(images, self.extractor)
         if not arrays:
             return answer_by_network(Pose(torch.zeros(0, 3), torch.zeros(0, 4)))
         records = extractor.extract(arrays)

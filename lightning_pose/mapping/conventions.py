@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from lightning_pose.geometry.epipolar import essential_matrices, sampson_distances_px
 from lightning_pose.mapping.frame_matches import FrameMatches
 
-__all__ = ["AS_READ", "Reading", "fit_focal_length", "rank_readings", "read_poses_as"]
+__all__ = ["AS_READ", "MATCHES_TO_RANK", "OUTLIER_PX", "Reading", "fit_focal_length", "rank_readings", "read_poses_as"]
 
 FOCAL_RANGE = (0.4, 2.5)
 """Focal lengths that are tried, in widths of the image: 103 to 23 degrees of view."""

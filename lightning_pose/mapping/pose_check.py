@@ -10,11 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from lightning_pose.errors import ImageError
 from lightning_pose.features.surf import SURF
+from lightning_pose.geometry.camera import Camera
 from lightning_pose.geometry.triangulation import find_two_view_depths
-from lightning_pose.mapping.conventions import AS_READ, Reading, rank_readings
+from lightning_pose.mapping.clock_offset import MAX_OFFSET_S, STEP_S, fit_clock_offset
+from lightning_pose.mapping.conventions import AS_READ, MATCHES_TO_RANK, Reading, rank_readings
 from lightning_pose.mapping.frame_matches import FrameMatches, match_nearby_frames
 from lightning_pose.scenes.images import read_gray
-from lightning_pose.scenes.scene import Scene
+from lightning_pose.scenes.scene import Intrinsics, Scene
 
 __all__ = ["PoseCheck", "check_poses"]
 
@@ -35,6 +37,18 @@ FOCAL_TOLERANCE = 0.1
 
 PLAUSIBLE_DEPTH_M = (0.05, 300.0)
 """Median distance of what the cameras see, where positions are in metres."""
+
+CLEARER = 0.9
+"""Poses of another time are proposed if their cost and their residual are below this share of those as given."""
+
+MIN_OFFSET_S = 0.005
+"""Smaller offsets between clocks are not reported: images are exposed for that long."""
+
+FAR_CLOCK = 2.0, 0.02
+"""Offset in seconds, and step, of the search where poses do not fit at their times."""
+
+FEW_FEATURES = 25
+"""Fewer features in an image, and too little of it can be matched."""
 
 MIN_PARALLAX_DEG = 0.5
 """Rays of a match must differ by this much for its depth to count."""
@@ -86,12 +100,12 @@ def check_poses(scene: Scene) -> PoseCheck:
         scales.append(scale)
         sizes.append(size)
         counts.append(min(count, 300))
-        centre = (record["image_size"] - 1) / 2
-        return record["keypoints"][:count, :2] - centre, record["descriptors"][:count]
+        pixels = (record["keypoints"][:count, :2] + 0.5) / scale - 0.5
+        points = _undistort_points(pixels, scene.frames[frame].intrinsics, *size) * scale
+        return points, record["descriptors"][:count]
 
     matches = match_nearby_frames([frame.sequence for frame in scene.frames], read_keypoints)
-    if counts:
-        found.facts["features per frame"] = f"median {np.median(counts):.0f} of at most 300 SURF keypoints"
+    _judge_features(found, counts)
     quats = np.array([frame.quat_wxyz for frame in scene.frames])
     rotation = Rotation.from_quat(quats, scalar_first=True).as_matrix()
     position = np.array([frame.position_m for frame in scene.frames])
@@ -102,8 +116,57 @@ def check_poses(scene: Scene) -> PoseCheck:
     found.readings = rank_readings(matches, rotation, position, max(sizes[0]) * scales[0])
     _judge_readings(found, scales[0], len(matches.pair), FITS * max(sizes[0]) * scales[0])
     _judge_focal_length(found, scene, sizes[0])
+    _judge_clock(found, scene, matches, scales[0], FITS * max(sizes[0]) * scales[0])
     _judge_depth(found, scene, matches, rotation, position, found.focal_px * scales[0])
     return found
+
+
+def _undistort_points(pixels: np.ndarray, known: Intrinsics | None, width: int, height: int) -> np.ndarray:
+    """Pixels from the principal point, (N, 2), without distortion; of an unknown camera, from the image's centre."""
+    if known is None:
+        return pixels - (np.array([width, height]) - 1) / 2
+    known = known.for_size(width, height)
+    camera = Camera(width, height, known.fx, known.fx, known.cx, known.cy, known.distortion, known.fisheye)
+    return camera.normalize(pixels) * known.fx
+
+
+def _judge_features(found: PoseCheck, counts: list[int]) -> None:
+    """How many features images have, and how many have too few of them."""
+    if not counts:
+        return
+    found.facts["features per frame"] = (
+        f"median {np.median(counts):.0f}, least {min(counts)}, of at most 300 SURF keypoints ({len(counts)} frames)"
+    )
+    few = sum(count < FEW_FEATURES for count in counts)
+    if few:
+        found.warnings.append(
+            f"{few} of {len(counts)} images that were looked at have fewer than {FEW_FEATURES} features; leave out "
+            "blank, covered and dark images, or take larger ones"
+        )
+
+
+def _judge_clock(found: PoseCheck, scene: Scene, matches: FrameMatches, scale: float, fits_px: float) -> None:
+    """Whether the poses fit the images better at other times than their own."""
+    times = [frame.timestamp for frame in scene.frames if frame.timestamp is not None]
+    if scene.trajectory is None or len(times) < len(scene.frames) or found.errors:
+        return
+    times_s, focal_px = np.array(times), found.focal_px * scale
+    best = fit_clock_offset(matches, times_s, scene.trajectory, focal_px)
+    if best is None or best.residual_px > fits_px or abs(best.offset_s) > MAX_OFFSET_S - STEP_S:
+        few = matches.sample(MATCHES_TO_RANK)
+        best = fit_clock_offset(few, times_s, scene.trajectory, focal_px, *FAR_CLOCK) or best
+    if best is None or best.residual_px > fits_px:
+        return
+    shift = f"{best.residual_px / scale:.2f} px at {1000 * best.offset_s:+.0f} ms"
+    found.facts["clock of the poses"] = f"{shift}, {best.residual_at_zero_px / scale:.2f} px as given"
+    clearer = best.cost < CLEARER * best.cost_at_zero and best.residual_px < CLEARER * best.residual_at_zero_px
+    if clearer and abs(best.offset_s) >= MIN_OFFSET_S:
+        verb, prep = ("subtract", "from") if best.offset_s > 0 else ("add", "to")
+        found.warnings.append(
+            f"the poses fit the images better at other times ({shift}, {best.residual_at_zero_px / scale:.2f} px as "
+            f"given), so that the clocks of images and poses differ; {verb} {abs(best.offset_s):.3f} s {prep} the "
+            "times of the poses"
+        )
 
 
 def _judge_readings(found: PoseCheck, scale: float, n_matches: int, fits_px: float) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import warnings
 from dataclasses import asdict
 from typing import ClassVar, Literal
@@ -13,6 +14,7 @@ from torch import Tensor, nn
 from lightning_pose.data.batches import PoseBatch, PoseDataset
 from lightning_pose.data.datamodule import SceneDataModule, find_datamodule, scene_datamodule
 from lightning_pose.errors import ConfigError
+from lightning_pose.features import LocalExtractor
 from lightning_pose.geometry.quaternions import align_hemisphere, quat_normalize
 from lightning_pose.losses import LossConfig, PoseLoss
 from lightning_pose.metrics.item_means import ItemMeans, key_items, key_poses
@@ -26,6 +28,8 @@ from lightning_pose.models.parts.standardization import StandardizedModule
 from lightning_pose.models.parts.world_frame import WorldFrame
 
 __all__ = ["Located", "Pose", "PoseModule"]
+
+_log = logging.getLogger("lightning_pose")
 
 Stage = Literal["train", "val", "test"]
 
@@ -185,7 +189,7 @@ class PoseModule(RefinedModule, StandardizedModule):
         if datamodule is not None and stage == "fit":
             train = datamodule.dataset("train")
             for split in self.training_splits:
-                check_features(datamodule.dataset(split).data)
+                check_features(datamodule.dataset(split).data, isinstance(datamodule.extractor, LocalExtractor))
             self.fit_world_frame(train)
             position_m, quat_wxyz = self.training_poses(train)
             position = self.world_frame.to_local(position_m)
@@ -284,6 +288,12 @@ class PoseModule(RefinedModule, StandardizedModule):
         self.divergence.check_epoch(self._remedy)
         self.divergence.check_weights(self.parameters(), self._remedy)
 
+    def on_train_end(self) -> None:
+        """Say so where training has ended worse than it began."""
+        growth = self.divergence.describe_growth()
+        if growth is not None:
+            _log.warning("training has diverged: %s; %s", growth, self._remedy)
+
     def _log_metrics(self, metrics: PoseMetrics, losses: ItemMeans, stage: Stage) -> None:
         """Log the means over all processes, each item once.
 
@@ -293,7 +303,7 @@ class PoseModule(RefinedModule, StandardizedModule):
         errors = metrics.compute()
         if not self.trainer.sanity_checking:
             self.divergence.check_epoch(self._remedy)  # before this epoch's checkpoint is written
-            self.divergence.check_error(errors["position_median_m"], self._remedy)
+            self.divergence.check_error(errors["position_median_m"] / self.world_frame.scale, self._remedy)
         named = {_name_loss(stage, name): value for name, value in losses.compute().items()}
         # Every process has the same values, which `sync_dist` leaves as they are; without it Lightning warns.
         self.log_dict(named | {f"{stage}/{name}": value for name, value in errors.items()}, sync_dist=True)

@@ -16,7 +16,7 @@ from lightning_pose.runs.callbacks import find_callback
 from lightning_pose.runs.checkpoints import checkpoint_folder, run_logger
 from lightning_pose.runs.logger import MLflowLogger, flatten_settings
 from lightning_pose.runs.resume import read_seed
-from lightning_pose.runs.tags import OPERATIONAL
+from lightning_pose.runs.tags import DIVERGED, OPERATIONAL
 
 __all__ = ["RunRecorder"]
 
@@ -103,6 +103,9 @@ class RunRecorder(Callback):
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         logger = run_logger(trainer)
+        growth = pl_module.divergence.describe_growth() if isinstance(pl_module, PoseModule) else None
+        if logger is not None and growth is not None:
+            logger.client.set_tag(str(logger.run_id), DIVERGED, growth)
         if logger is not None and self.keeps_checkpoints:
             for file in sorted(checkpoint_folder(trainer).glob("*.ckpt")):
                 logger.client.log_artifact(str(logger.run_id), str(file), "checkpoints")

@@ -1,12 +1,15 @@
 """Names of the tags of MLflow runs and the user attributes of Optuna trials that the project writes and reads."""
 
-__all__ = ["CURVES", "METRICS", "NOTE", "OPERATIONAL", "PARENT_TAG", "PROCESS", "REASON", "RUN"]
+__all__ = ["CURVES", "DIVERGED", "METRICS", "NOTE", "OPERATIONAL", "PARENT_TAG", "PROCESS", "REASON", "RUN"]
 
 PARENT_TAG = "mlflow.parentRunId"
 """Tag of an MLflow run: the id of the run that it is nested in."""
 
 NOTE = "mlflow.note.content"
 """Tag that MLflow shows as a run's description, in Markdown."""
+
+DIVERGED = "diverged"
+"""Tag of a finished MLflow run whose training ended worse than it began: in what way."""
 
 OPERATIONAL = ("cache_dir", "workers", "eval_batch_size")
 """Settings of the data that no result depends on: a run does not record them, and a report does not compare them."""

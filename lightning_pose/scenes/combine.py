@@ -108,6 +108,7 @@ def join_scenes(train: Sequence[Scene], test: Sequence[Scene], val: Sequence[Sce
         splits={split: np.concatenate([np.zeros(0, np.int64), *parts]) for split, parts in splits.items()},
         split_source=seen[0].split_source if seen else "unseen",
         ground_truth=_join_values([scene.ground_truth for scene in train], [scene.ground_truth for scene in test]),
+        trajectory=train[0].trajectory if len(known) == 1 else None,  # times of recordings may overlap
     )
 
 

@@ -202,7 +202,7 @@ def _replace_poses(scene: Scene, listed: dict[tuple[str, ...], ListedPose], trut
     )
     number = np.cumsum(kept) - 1
     splits = {split: number[indices[kept[indices]]] for split, indices in scene.splits.items()}
-    return replace(scene, frames=frames, splits=splits, ground_truth=truth)
+    return replace(scene, frames=frames, splits=splits, ground_truth=truth, trajectory=None)
 
 
 def _match_names(names: list[tuple[str, ...]], listed: dict[tuple[str, ...], ListedPose]) -> list[ListedPose | None]:

@@ -15,6 +15,7 @@ from PIL import Image
 from lightning_pose.errors import ImageError
 
 __all__ = [
+    "DECODING_VERSION",
     "ImageFacts",
     "decode_image",
     "find_bits",
@@ -39,6 +40,12 @@ _FLAGS = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTAT
 
 DEPTHS = (8, 10, 12, 14, 16)
 """Bits a channel of cameras. Each uses a part of the range of a 16-bit file."""
+
+DECODING_VERSION = 2
+"""Raised when the same file gives other pixels, so that no features of the old ones are read from a cache.
+
+Version 1 read images of 9 to 15 bits in 16-bit files as dark ones.
+"""
 
 EXIF = cv2.IMAGE_METADATA_EXIF
 ORIENTATION_TAG = 0x0112

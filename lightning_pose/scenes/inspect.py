@@ -15,6 +15,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from lightning_pose.errors import ImageError
+from lightning_pose.scenes.gaps import describe_gaps
 from lightning_pose.scenes.images import ImageFacts, measure_image, read_bytes
 from lightning_pose.scenes.scene import SPLITS, Scene
 
@@ -186,9 +187,10 @@ def inspect_poses(scene: Scene) -> Findings:
     step, angle_deg, neighbours = _measure_steps(scene)
     if not len(step):
         return Findings([], [])
+    warnings = [] if (gaps := describe_gaps(scene)) is None else [gaps]
     if not np.ptp(_stack_positions(scene), axis=0).any():
         where = f"all {len(scene.frames)} positions are {scene.frames[0].position_m}"
-        return Findings([f"{where}; there is nothing to learn, check the pose files"], [])
+        return Findings([f"{where}; there is nothing to learn, check the pose files"], warnings)
     typical = float(np.median(step))
     far = (step > JUMP * typical) & (typical > 0)
     turned = angle_deg > max(JUMP * float(np.median(angle_deg)), JUMP_DEG)
@@ -198,7 +200,7 @@ def inspect_poses(scene: Scene) -> Findings:
         for k, i in enumerate(neighbours)
         if far[k] or turned[k]
     ]
-    return Findings([], _limit_findings(jumps, "jumps") + _find_lost_poses(scene))
+    return Findings([], warnings + _limit_findings(jumps, "jumps") + _find_lost_poses(scene))
 
 
 def _find_lost_poses(scene: Scene) -> list[str]:

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["SPLITS", "Frame", "Intrinsics", "Scene"]
+__all__ = ["SPLITS", "Frame", "Intrinsics", "Scene", "Trajectory"]
 
 SPLITS = ("train", "val", "test")
 
@@ -67,6 +68,20 @@ class Frame:
     intrinsics: Intrinsics | None = None
 
 
+class Trajectory(NamedTuple):
+    """Poses as a function of time, more or others than the images have; see `geometry.interpolation`.
+
+    Attributes:
+        times_s: (N,) on the clock of the poses, which should be that of the frames' timestamps; in any order.
+        positions_m: (N, 3), as those of frames.
+        quats_wxyz: (N, 4), as those of frames.
+    """
+
+    times_s: np.ndarray
+    positions_m: np.ndarray
+    quats_wxyz: np.ndarray
+
+
 @dataclass(frozen=True)
 class Scene:
     """Every frame of one place, and which frames are for training, validation and test.
@@ -83,6 +98,7 @@ class Scene:
         ground_truth: where the poses come from (`original`, `sfm`, `synthetic`, ...).
         bad_frames: what is wrong with each frame that the dataset lists and that is not in `frames`; each text begins
             with the file, and the line where there are several.
+        trajectory: all sound poses of the dataset, where it has them by time, whether or not a frame has their time.
     """
 
     name: str
@@ -94,3 +110,4 @@ class Scene:
     unit: str = "m"
     ground_truth: str = "original"
     bad_frames: tuple[str, ...] = ()
+    trajectory: Trajectory | None = None

@@ -52,10 +52,16 @@ def make_splits(
 
     Raises:
         ConfigError: a fraction is outside 0..1, or leaves no frame to train on.
-        DataError: the scene has no frames.
+        DataError: the scene has no frames, or fewer than splits.
     """
     if not scene.frames:
         raise DataError(f"{scene.root} holds no posed image; check that the download is complete")
+    parts = 1 + (val_fraction > 0) + (bool(scene.splits) or test_fraction > 0)
+    if len(scene.frames) < parts:
+        count = "1 frame" if len(scene.frames) == 1 else f"{len(scene.frames)} frames"
+        raise DataError(
+            f"{scene.root} has {count}; to train, validate and test takes {parts}, and far more to learn anything"
+        )
     sequences = np.array([frame.sequence for frame in scene.frames])
     runs = np.cumsum(find_run_starts(scene))
     if scene.splits:
@@ -64,7 +70,7 @@ def make_splits(
         train, test = hold_out(np.arange(len(sequences)), sequences, test_fraction, "test_fraction", runs=runs)
     if "val" in scene.splits:
         return {"train": train, "val": scene.splits["val"], "test": test}
-    train, val = hold_out(train, sequences, val_fraction, "val_fraction", val_block, runs)
+    train, val = hold_out(train, sequences, val_fraction, "data.val_fraction", val_block, runs)
     return {"train": train, "val": val, "test": test}
 
 

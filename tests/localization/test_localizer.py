@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from lightning_pose.checkpoint import read_checkpoint
-from lightning_pose.errors import CheckpointError, ImageError
+from lightning_pose.errors import CheckpointError, ConfigError, ImageError
 from lightning_pose.localization.localizer import Localizer
 from lightning_pose.scenes.images import read_gray
 from tests.helpers import Thumbnails, Trained
@@ -56,6 +56,31 @@ def test_it_does_not_learn(localizer: Localizer, images: list[Path]) -> None:
 def test_an_image_that_is_missing(localizer: Localizer) -> None:
     with pytest.raises(ImageError, match=r"nowhere.png does not exist; check"):
         localizer(["nowhere.png"])
+
+
+@pytest.mark.parametrize(
+    ("images", "message"),
+    [
+        (None, r"images is None \(NoneType\); give an image file"),
+        (7, r"images is 7 \(int\)"),
+        (b"a.png", r"images is b'a.png' \(bytes\)"),
+        ([None], r"image 0 is None \(NoneType\)"),
+        (np.zeros((4, 5), np.float32), r"shape \(4, 5\) and type float32; thumbnails reads uint8 \(H, W\) gray"),
+        ([np.zeros((4, 5, 3), np.uint8)], r"shape \(4, 5, 3\) and type uint8"),
+        (np.zeros((0, 5), np.uint8), r"shape \(0, 5\)"),
+    ],
+)
+def test_what_is_no_image_is_refused_in_one_line(localizer: Localizer, images: object, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        localizer(images)  # pyright: ignore[reportArgumentType]
+
+
+def test_folders_and_videos_are_refused(localizer: Localizer, tmp_path: Path) -> None:
+    with pytest.raises(ImageError, match=r"is a folder; give its images"):
+        localizer(tmp_path)
+    (tmp_path / "walk.MP4").write_bytes(b"video")
+    with pytest.raises(ImageError, match=r"walk.MP4 is a video; give its frames"):
+        localizer(str(tmp_path / "walk.MP4"))
 
 
 @pytest.mark.parametrize("content", [b"", b"garbage", b"PK\x03\x04 a broken archive"])

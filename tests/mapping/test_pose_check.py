@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -13,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from lightning_pose.mapping.conventions import AS_READ
 from lightning_pose.mapping.pose_check import check_poses
 from lightning_pose.scenes.formats import load_scene
-from lightning_pose.scenes.scene import Frame, Intrinsics, Scene
+from lightning_pose.scenes.scene import Frame, Intrinsics, Scene, Trajectory
 from lightning_pose.scenes.synthetic import render_room
 
 
@@ -86,6 +87,29 @@ def test_a_camera_that_stands_still_is_not_compared(room: Scene) -> None:
     found = check_poses(rewrite(room, lambda R, c: (R, np.zeros(3))))
     assert found.facts["poses and images"].startswith("not compared")
     assert (found.errors, found.warnings, found.readings) == ([], [], [])
+
+
+@pytest.mark.parametrize("offset_s", [0.0, 0.05])
+def test_clocks_that_differ_are_a_warning(room: Scene, offset_s: float) -> None:
+    frames = tuple(replace(f, sequence="walk", timestamp=0.1 * i) for i, f in enumerate(room.frames))
+    positions, quats = (np.array([getattr(f, name) for f in frames]) for name in ("position_m", "quat_wxyz"))
+    times = np.array([0.1 * i for i in range(len(frames))])
+    found = check_poses(replace(room, frames=frames, trajectory=Trajectory(times + offset_s, positions, quats)))
+    assert "clock of the poses" in found.facts
+    shifted = [
+        warning for warning in found.warnings if "subtract 0.0" in warning and "the times of the poses" in warning
+    ]
+    assert len(shifted) == (offset_s > 0)
+    assert found.errors == []
+
+
+def test_images_with_few_features_are_counted(room: Scene, tmp_path: Path) -> None:
+    blank = tmp_path / "blank.png"
+    cv2.imwrite(str(blank), np.full((120, 160), 90, np.uint8))
+    frames = (replace(room.frames[0], image=blank), *room.frames[1:])
+    (warning,) = check_poses(replace(room, frames=frames)).warnings
+    assert warning.startswith("1 of ")
+    assert "fewer than 25 features" in warning
 
 
 def test_images_that_cannot_be_read_are_passed_over(room: Scene) -> None:

@@ -13,17 +13,22 @@ from lightning_pose.errors import ConfigError
 __all__ = ["DivergenceWatch"]
 
 FACTOR = 1000.0
-FLOOR_M = 1e-3  # where all training positions are one
+
+WORSE = 3.0
+"""Positions off by this many times the training positions' spread are worse than any constant answer."""
 
 
 class DivergenceWatch:
     """Collects losses and errors of training steps on their device, and compares them once an epoch.
 
     Training has diverged where a loss, an error or a weight is not finite, or where the mean position error is over
-    1000 times what it was at the first step plus the spread of the training positions.
+    1000 times what it was at the first step plus the spread of the training positions. It has grown apart where the
+    last epoch's loss and errors are finite, and worse than the first epoch's and than a constant answer's.
+
+    Positions are local, as networks see them.
 
     Attributes:
-        spread_m: mean distance of the training positions from their mean.
+        spread_m: mean distance of the training positions from their mean; 0 for one position, which sets no bound.
     """
 
     def __init__(self) -> None:
@@ -31,6 +36,7 @@ class DivergenceWatch:
         self._first: Tensor | None = None
         self._sums: Tensor | None = None
         self._steps = 0
+        self._epochs: list[tuple[float, float]] = []  # loss and position error of the first and the last epoch
 
     def add_step(self, loss: Tensor, position_hat: Tensor, position_m: Tensor) -> None:
         """Add the loss and the positions (..., 3) of one training step."""
@@ -57,16 +63,29 @@ class DivergenceWatch:
         if not math.isfinite(loss):
             raise ConfigError(f"training has diverged: the loss is {loss}; {remedy}")
         self.check_error(error, remedy)
+        self._epochs = [*self._epochs[:1], (loss, error)]
+
+    def describe_growth(self) -> str | None:
+        """What is wrong with a training that has ended farther off than it began; None if nothing is."""
+        if len(self._epochs) < 2:
+            return None
+        (first_loss, first_error), (loss, error) = self._epochs
+        if not (loss > first_loss and error > first_error and error > WORSE * self.spread_m > 0):
+            return None
+        return (
+            f"the loss grew from {first_loss:.3g} in the first epoch to {loss:.3g} in the last, and training positions "
+            f"are off by {error:.3g}, {error / self.spread_m:.1f} times their spread"
+        )
 
     def check_error(self, error_m: float, remedy: str) -> None:
-        """Compare a mean or median position error in metres with that of the first step.
+        """Compare a mean or median error of local positions with that of the first step.
 
         Raises:
             ConfigError: training has diverged.
         """
         if self._first is None:
             return
-        most = FACTOR * (float(self._first) + self.spread_m) + FLOOR_M
+        most = FACTOR * (float(self._first) + (self.spread_m or 1.0))
         if not error_m <= most:
             raise ConfigError(
                 f"training has diverged: positions are off by {error_m:.3g} m, and training positions lie "

@@ -37,8 +37,12 @@ class Located(NamedTuple):
     quat_wxyz: Tensor
 
 
-def check_features(data: PoseBatch) -> None:
-    """Warn of frames without features.
+def check_features(data: PoseBatch, local: bool = False) -> None:
+    """Warn of frames without features, and of those with fewer local features than the network reads.
+
+    Args:
+        data: the frames of a split.
+        local: whether features are (M, N, D), with zero rows after the last feature of a frame.
 
     Raises:
         DataError: features of some frames are not finite numbers, or most frames have no features.
@@ -62,6 +66,25 @@ def check_features(data: PoseBatch) -> None:
             len(empty),
             len(data.frame),
             empty[0],
+        )
+    if local:
+        _warn_of_few_features(data)
+
+
+def _warn_of_few_features(data: PoseBatch) -> None:
+    """Log how many frames have fewer than N features, and how many such a frame has."""
+    found = data.features.any(-1).sum(-1)
+    wanted = data.features.shape[-2]
+    few = found[(found > 0) & (found < wanted)]
+    if len(few):
+        _log.warning(
+            "%d of %d training frames have fewer than %d features (median %d, least %d); their missing rows are zeros; "
+            "lower data.extractor.n_features if these are many",
+            len(few),
+            len(found),
+            wanted,
+            int(few.median()),
+            int(few.min()),
         )
 
 

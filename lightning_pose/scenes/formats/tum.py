@@ -21,7 +21,7 @@ from lightning_pose.scenes.formats.image_files import (
 )
 from lightning_pose.scenes.formats.poses import check_quats
 from lightning_pose.scenes.formats.text_files import NumberTable, find_file, list_files, read_lines, read_table
-from lightning_pose.scenes.scene import Frame, Intrinsics, Scene
+from lightning_pose.scenes.scene import Frame, Intrinsics, Scene, Trajectory
 
 __all__ = ["FORMAT", "TRAJECTORY_COLUMNS", "Tum", "is_numbered", "pair_by_time"]
 
@@ -73,18 +73,18 @@ class Tum(SceneFormat):
         if missed:
             log.warning("%s: dropped %d of %d images, no pose within 20 ms", root, missed, len(listed.times))
         rows = pairs[:, 1]
-        position_m, quats, found = check_quats(table.values[rows, 1:4], table.values[rows, 4:], scalar_first=False)
-        faults = [
-            table.faults[j] or (wrong and f"{table.places[j]}: {wrong}") for j, wrong in zip(rows, found, strict=True)
-        ]
+        position_m, quats, found = check_quats(table.values[:, 1:4], table.values[:, 4:], scalar_first=False)
+        faults = [table.faults[j] or (found[j] and f"{table.places[j]}: {found[j]}") for j in rows]
+        sound = np.isfinite(pose_times) & ~np.array([bool(fault) for fault in found])
+        known = Trajectory(pose_times[sound], position_m[sound], quats[sound])
         name = root.resolve().name
         intrinsics = next((camera for key, camera in CAMERAS.items() if key in name), None)
         frames = [
             Frame(listed.images[i], position, quat, name, int(i), float(listed.times[i]), intrinsics)
-            for i, position, quat in zip(pairs[:, 0], position_m, quats, strict=True)
+            for i, position, quat in zip(pairs[:, 0], position_m[rows], quats[rows], strict=True)
         ]
         usable, bad = keep_usable(frames, faults, "rgb.txt")
-        return Scene(name, root, self.name, usable, bad_frames=(*listed.faults, *bad))
+        return Scene(name, root, self.name, usable, bad_frames=(*listed.faults, *bad), trajectory=known)
 
 
 FORMAT = Tum()

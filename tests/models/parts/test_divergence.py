@@ -40,6 +40,31 @@ def test_weights_that_are_no_numbers() -> None:
         watch_steps(1.0).check_weights([torch.zeros(2), torch.tensor([0.0, torch.inf])], "")
 
 
+def test_a_training_that_ends_worse_than_it_began() -> None:
+    for ends, grown in ((5.0, True), (2.0, False), (0.5, False)):
+        watch = DivergenceWatch()
+        watch.spread_m = 1.0
+        for error in (1.0, ends):
+            watch.add_step(torch.tensor(error), torch.tensor([[error, 0.0, 0.0]]), torch.zeros(1, 3))
+            watch.check_epoch("")
+        growth = watch.describe_growth()
+        assert (growth is not None) == grown
+        assert growth is None or "grew from 1 in the first epoch to 5 in the last" in growth
+
+
+def test_a_far_start_or_a_single_epoch_is_no_growth() -> None:
+    watch = watch_steps(50.0)
+    assert watch.describe_growth() is None
+    watch.check_epoch("")
+    assert watch.describe_growth() is None
+
+
+def test_one_training_frame_sets_no_bound_to_the_others() -> None:
+    watch = DivergenceWatch()
+    watch.add_step(torch.tensor(0.0), torch.zeros(1, 3), torch.zeros(1, 3))
+    watch.check_error(0.5, "")
+
+
 def test_frames_at_one_place() -> None:
     watch = DivergenceWatch()
     watch.add_step(torch.tensor(0.0), torch.zeros(1, 3), torch.zeros(1, 3))

@@ -173,7 +173,7 @@ def test_lines_gone_from_the_image_list_are_counted(tmp_path: Path, caplog: pyte
 
 def test_times_without_their_last_digits_are_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     write(tmp_path, [1600000000 + 0.1 * i for i in range(9)], [f"1.600000e+09 {i} 0 0 0 0 0 1" for i in range(9)])
-    with caplog.at_level(logging.WARNING, "lightning_pose"), pytest.raises(ConfigError, match="leaves none"):
+    with caplog.at_level(logging.WARNING, "lightning_pose"), pytest.raises(DataError, match="has 1 frame; to train"):
         load_scene(tmp_path)
     assert "groundtruth.txt: 9 lines have 1 different times; write times with all digits" in caplog.text
 
