@@ -30,6 +30,7 @@ from lightning_pose.scenes.synthetic.room import make_room
 SHOWN = (0.25, 0.5, 0.75)
 """Which test frames are shown, as parts of the test split: the quarters, whatever their errors are."""
 
+ALONE = "#E69F00"
 VIEW_DEPTH_M = 0.8
 LETTERS = "ABC"
 LABEL = {"facecolor": "white", "edgecolor": "none", "pad": 2}
@@ -60,24 +61,31 @@ def draw_room(axes: Axes, seed: int) -> None:
             axes.add_patch(Polygon(np.array(corners)[:, :2], fc="#f2ead9", ec="#d8cdb5", zorder=0.5))
 
 
-def draw_map(axes: Axes, scene: Scene, position_m: np.ndarray, quat_wxyz: np.ndarray, shown: list[int]) -> None:
+def draw_map(
+    axes: Axes, scene: Scene, refined: tuple[np.ndarray, np.ndarray], alone_m: np.ndarray, shown: list[int]
+) -> None:
     """Draw training frames, true and predicted test positions, and the views of the frames shown, from above."""
+    position_m, quat_wxyz = refined
     draw_room(axes, seed=0)
     test = [scene.frames[i] for i in scene.splits["test"]]
     truth = np.array([frame.position_m for frame in test])
     training = np.array([scene.frames[i].position_m for i in scene.splits["train"]])
     axes.plot(*training[:, :2].T, ".", color=TRAINING, markersize=4, label="training frames")
-    segments = list(np.stack([truth[:, :2], position_m[:, :2]], axis=1))
-    axes.add_collection(LineCollection(segments, colors=MODEL, linewidths=0.7, alpha=0.3))
-    axes.plot(*truth[:, :2].T, ".", color=TRUTH, markersize=5, label="test frames, true")
-    axes.plot(*position_m[:, :2].T, ".", color=MODEL, markersize=5, label="test frames, predicted")
+    segments = list(np.stack([truth[:, :2], alone_m[:, :2]], axis=1))
+    axes.add_collection(LineCollection(segments, colors=ALONE, linewidths=0.7, alpha=0.4))
+    axes.plot(*alone_m[:, :2].T, ".", color=ALONE, markersize=5, label="test frames, the network alone")
+    axes.plot(*truth[:, :2].T, ".", color=TRUTH, markersize=9, label="test frames, true")
+    axes.plot(*position_m[:, :2].T, ".", color=MODEL, markersize=4, label="test frames, refined by the map")
     camera = test[0].intrinsics
     assert camera is not None
     half_angle = float(np.arctan(camera.cx / camera.fx))
     quats = np.array([test[i].quat_wxyz for i in shown])
-    for color, centres, turns in ((TRUTH, truth[shown], quats), (MODEL, position_m[shown], quat_wxyz[shown])):
+    for color, width, centres, turns in (
+        (TRUTH, 3.5, truth[shown], quats),
+        (MODEL, 1.2, position_m[shown], quat_wxyz[shown]),
+    ):
         triangles = view_triangles(centres, turns, half_angle)
-        axes.add_collection(PolyCollection(list(triangles), facecolors="none", edgecolors=color, linewidths=1.6))
+        axes.add_collection(PolyCollection(list(triangles), facecolors="none", edgecolors=color, linewidths=width))
     for letter, i in zip(LETTERS, shown, strict=True):
         x, y = truth[i, :2].tolist()
         axes.annotate(letter, (x, y), xytext=(-6, -18), textcoords="offset points", fontsize=13, weight="bold")
@@ -87,17 +95,17 @@ def draw_map(axes: Axes, scene: Scene, position_m: np.ndarray, quat_wxyz: np.nda
         ylabel="y (m)",
         title="The room from above: true and predicted cameras",
     )
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=3, markerscale=2)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=2, markerscale=2)
 
 
 @matplotlib.rc_context(STYLE)
-def draw_picture(scene: Scene, position_m: np.ndarray, quat_wxyz: np.ndarray) -> Figure:
+def draw_picture(scene: Scene, refined: tuple[np.ndarray, np.ndarray], alone_m: np.ndarray) -> Figure:
     """Test frames on the left, the map on the right.
 
     Args:
         scene: the synthetic room.
-        position_m: (N, 3) predicted positions of the N test frames.
-        quat_wxyz: (N, 4) predicted orientations.
+        refined: (N, 3) positions and (N, 4) quaternions of the N test frames.
+        alone_m: (N, 3) positions by the network alone.
     """
     test = [scene.frames[i] for i in scene.splits["test"]]
     shown = [int(part * len(test)) for part in SHOWN]
@@ -108,7 +116,7 @@ def draw_picture(scene: Scene, position_m: np.ndarray, quat_wxyz: np.ndarray) ->
         axes.imshow(Image.open(test[i].image))
         axes.text(0.03, 0.95, letter, transform=axes.transAxes, va="top", fontsize=13, weight="bold", bbox=LABEL)
         axes.set_axis_off()
-    draw_map(figure.add_subplot(grid[:, 1]), scene, position_m, quat_wxyz, shown)
+    draw_map(figure.add_subplot(grid[:, 1]), scene, refined, alone_m, shown)
     return figure
 
 
@@ -119,9 +127,12 @@ def main() -> None:
     args = parser.parse_args()
     scene = load_scene(room_folder(seed=0, frames=300))
     localizer = Localizer.from_checkpoint(args.checkpoint)
-    poses = localizer([scene.frames[i].image for i in scene.splits["test"]])
+    images = [scene.frames[i].image for i in scene.splits["test"]]
+    refined = localizer(images)
+    localizer.model.refinement = None
+    alone_m, _ = localizer(images)
     drawn = io.BytesIO()
-    draw_picture(scene, *poses).savefig(drawn)
+    draw_picture(scene, refined, alone_m).savefig(drawn)
     Image.open(drawn).convert("RGB").quantize(COLORS).save(args.picture, optimize=True)
     print(args.picture)
 
