@@ -54,7 +54,8 @@ def test_without_a_camera_the_focal_length_is_found_and_printed(capsys: pytest.C
 
 
 def test_a_camera_of_other_images_is_scaled() -> None:
-    model, _ = fit_wall(camera="PINHOLE,1280,960,1000,1000,639.5,479.5")
+    few = WallProblem([WALL_KEYPOINTS, 36], count=10)
+    model, _ = fit_wall(few, camera="PINHOLE,1280,960,1000,1000,639.5,479.5")
     view = model.network.view
     np.testing.assert_allclose([view.width, view.fx, view.cx, view.cy], [640, 500, 319.5, 239.5])
 
