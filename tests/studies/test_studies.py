@@ -18,10 +18,10 @@ from lightning_pose.errors import ConfigError
 from lightning_pose.features.base import Record
 from lightning_pose.studies.figure import draw_groups
 from lightning_pose.studies.figure_spec import FigureSpec, parse_figure_spec
-from lightning_pose.studies.result import write_markdown
 from lightning_pose.studies.table import Group, build_rows, name_value, varying_settings
 from lightning_pose.sweeps.plan import Plan, read_plan
 from lightning_pose.sweeps.space import parse_space
+from lightning_pose.terminal import format_markdown
 from tests.helpers import Thumbnails, Workplace
 
 Study = Callable[..., Path]
@@ -226,7 +226,7 @@ def test_a_table_has_means_and_their_range() -> None:
         Group({"model.units": 3, "model.cell": "gru"}, reason="no | such"),
     ]
     assert varying_settings(groups) == ["model.units"]
-    assert write_markdown(*build_rows(groups, figure_spec(y=TEST))).splitlines() == [
+    assert format_markdown(*build_rows(groups, figure_spec(y=TEST))).splitlines() == [
         "| units | trials | median position error (m) |",
         "| --- | --- | --- |",
         "| 1 | 2 | 0.2 (0.1 to 0.3) |",
