@@ -173,7 +173,7 @@ class ClipProblem(LearnableProblem, ClipDataModule):
 class WallProblem(LearnableProblem):
     """Keypoints of a wall as cameras along it see them, in the form of a local extractor with its geometry."""
 
-    def __init__(self, input_shape: list[int], count: int = 24) -> None:
+    def __init__(self, input_shape: list[int], count: int = 12) -> None:
         super().__init__(input_shape, count)
         self.extractor = SURF(input_shape[0], with_geometry=True)
         frames, self.splits = [], {}

@@ -22,7 +22,7 @@ CAMERA = "PINHOLE,640,480,500,500,319.5,239.5"
 
 
 def fit_wall(problem: WallProblem | None = None, **settings: object) -> tuple[LandmarkMap, WallProblem]:
-    problem = problem or WallProblem([WALL_KEYPOINTS, 36], count=30)
+    problem = problem or WallProblem([WALL_KEYPOINTS, 36])
     model = LandmarkMap(**{"input_shape": [WALL_KEYPOINTS, 36], "bundle_adjust": False, **settings})  # type: ignore[arg-type]
     trainer = Trainer(
         max_epochs=1, accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False,
@@ -47,15 +47,14 @@ def test_without_a_camera_the_focal_length_is_found_and_printed(capsys: pytest.C
     model, problem = fit_wall()
     printed = capsys.readouterr().out
     assert "the camera is unknown: a focal length of" in printed
-    assert "map of 60 frames" in printed
+    assert "map of 24 frames" in printed
     assert model.network.view.focal_px == pytest.approx(500, rel=0.03)
     data = problem.dataset("test").data
     assert position_error_m(model(data.features).position_m, data.position_m).median() < 0.03
 
 
 def test_a_camera_of_other_images_is_scaled() -> None:
-    few = WallProblem([WALL_KEYPOINTS, 36], count=10)
-    model, _ = fit_wall(few, camera="PINHOLE,1280,960,1000,1000,639.5,479.5")
+    model, _ = fit_wall(camera="PINHOLE,1280,960,1000,1000,639.5,479.5")
     view = model.network.view
     np.testing.assert_allclose([view.width, view.fx, view.cx, view.cy], [640, 500, 319.5, 239.5])
 
@@ -103,7 +102,7 @@ def test_frames_of_which_nothing_can_be_triangulated_are_refused() -> None:
     problem = WallProblem([WALL_KEYPOINTS, 36])
     frames = problem.scene.frames
     problem._scene = replace(problem.scene, frames=tuple(replace(f, position_m=np.zeros(3)) for f in frames))
-    with pytest.raises(DataError, match=r"no point of wall could be triangulated from 24 frames.*check"):
+    with pytest.raises(DataError, match=r"no point of wall could be triangulated from 12 frames.*check"):
         fit_wall(problem, camera=CAMERA)
 
 
