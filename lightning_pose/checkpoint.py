@@ -70,6 +70,10 @@ RENAMED_CLASSES = {
 """Class paths in older checkpoints and configs, to today's. A path that is listed here must never name a new class."""
 
 
+MOVED_SETTINGS = {("lightning_pose.models.LandmarkMap", "camera"): "camera"}
+"""Settings of a model, by its class and name, that are settings of the data now, to their name there."""
+
+
 def resolve_class_path(path: str) -> str:
     """Today's class path for one in an older file; the path itself if it was never renamed."""
     return RENAMED_CLASSES.get(path, path)
@@ -158,12 +162,14 @@ def check_specs(specs: object, allow: str | Iterable[str] = ()) -> dict[str, Spe
     allow = _list_allowed(allow)
     model = _check_spec(specs["model"], allow)
     _import_class(model["class_path"], ("lightning_pose.models",))
+    moved = _take_moved_settings(model)
     data = specs.get("data")
     if data is None:
         return {"model": model, "data": None}
     arguments = data.get("init_args") if isinstance(data, Mapping) else None
     if not isinstance(arguments, Mapping) or "extractor" not in arguments:
         raise CheckpointError("the checkpoint does not say which features it reads; train it again")
+    arguments = {**arguments, **moved}
     extractor = _check_spec(arguments["extractor"], allow)
     _import_class(extractor["class_path"], ("lightning_pose.features",))
     others = {name: value for name, value in arguments.items() if name != "extractor"}
@@ -171,6 +177,12 @@ def check_specs(specs: object, allow: str | Iterable[str] = ()) -> dict[str, Spe
     _import_class(data["class_path"], ("lightning_pose.data",))
     data["init_args"]["extractor"] = extractor
     return {"model": model, "data": data}
+
+
+def _take_moved_settings(model: Spec) -> Spec:
+    """Take out of a model's spec what is a setting of the data now."""
+    names = [(name, new) for (path, name), new in MOVED_SETTINGS.items() if path == model["class_path"]]
+    return {new: model["init_args"].pop(name) for name, new in names if name in model["init_args"]}
 
 
 CLASS_SETTINGS = ("class_path", "model", "data", "extractor", "backbone")

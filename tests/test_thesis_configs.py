@@ -13,6 +13,7 @@ import yaml
 from lightning_pose import models
 from lightning_pose.losses import LossConfig
 from lightning_pose.sweeps.base_config import ParsedConfig, list_settings
+from lightning_pose.sweeps.plan import read_plan
 from tests.helpers import REPOSITORY
 
 THESIS = sorted((REPOSITORY / "configs" / "thesis").glob("*.yaml"))
@@ -100,6 +101,13 @@ def test_a_study_starts_from_the_form_of_the_thesis(study: Path) -> None:
     others = {base for base in bases if not (study.parent / base).resolve().is_relative_to(THESIS[0].parent)}
     assert others <= {"../../configs/posenet.yaml"}, "the only peer that is not the thesis's"
     assert not any(key.startswith("model.") for key in content.get("settings", {})), "the network is the thesis's"
+
+
+def test_another_backbone_is_that_of_the_systems_that_have_one() -> None:
+    plan = read_plan(REPOSITORY / "sweeps" / "thesis" / "table_5_1.yaml", {"data.extractor.backbone": "vgg16"})
+    (backbone,) = (parameter for parameter in plan.space if parameter.key == "data.extractor.backbone")
+    assert backbone.example() == ["vgg16"]
+    assert {base for base in plan.bases if backbone.active({"base": base})} == {"linear_posenet", "dense_posenet"}
 
 
 def test_node_pose_is_searched_up_to_the_neighbours_of_the_thesis() -> None:

@@ -16,6 +16,9 @@ EXPECTED = re.compile(
 )
 GIVEN = re.compile(r"\b(?:Given|Got) value: (.*)")
 REQUIRED = re.compile(r"the following arguments are required: (.*)")
+MOVED = {"model: Option 'camera' is not accepted": "model.camera is data.camera now; give it there"}
+"""What to say of settings that have another place now."""
+
 KINDS = {
     "bool": "true or false",
     "int": "a whole number (int)",
@@ -52,7 +55,7 @@ def explain_setting_error(message: str) -> str:
     if required:
         names = " and no ".join(name.rpartition(".")[2] for name in required[1].split(", "))
         text = f"there is no {names}; give a complete config, such as --config configs/surf_lstm.yaml"
-    return f"{text}; {REMEDY}"
+    return f"{MOVED.get(text, text)}; {REMEDY}"
 
 
 def _clean_line(line: str) -> str:

@@ -44,6 +44,8 @@ class ClipDataModule(SceneDataModule):
         ground_truth: `original`, as the dataset has it; `registered`, moved to the colour camera (7-Scenes); or `sfm`,
             from `pgt`.
         pgt: folder of the pseudo ground truth of Brachmann et al. (ICCV 2021), which holds sfm/7scenes/SCENE_train.txt.
+        camera: of all images, as `MODEL,WIDTH,HEIGHT,PARAMETERS...` in COLMAP's notation, with the centre of the first
+            pixel at (0, 0); such as PINHOLE,640,480,525,525,319.5,239.5. That of the dataset if not given.
         clip_length: T, 2 to 400.
         stride: from one frame of a clip to the next.
         hop: from the first frame of a clip to that of the next; by default clips share one frame, so that they chain.
@@ -64,6 +66,8 @@ class ClipDataModule(SceneDataModule):
         room_frames: how many frames of each.
         on_bad_frame: `refuse` a scene with frames whose pose or image is missing or useless, or `drop` these frames and
             say how many there are.
+        split: which frames to test on: `every_5` (any number), `folders:NAME,NAME`, `blocks`, or a text file with
+            `IMAGE train|val|test` in each line; the format's own split, or blocks, if not given.
 
     Raises:
         ConfigError: a number is out of its range, or scenes are named in two ways.
@@ -82,6 +86,7 @@ class ClipDataModule(SceneDataModule):
         format: str | None = None,
         ground_truth: GroundTruth = "original",
         pgt: str | None = None,
+        camera: str | None = None,
         clip_length: int = 10,
         stride: int = 1,
         hop: int | None = None,
@@ -98,6 +103,7 @@ class ClipDataModule(SceneDataModule):
         test_rooms: list[int] = [1],  # noqa: B006
         room_frames: int = 300,
         on_bad_frame: OnBadFrame = "refuse",
+        split: str | None = None,
     ) -> None:
         super().__init__(extractor, batch_size, eval_batch_size, cache_dir, workers)
         check_relative_frame(relative_frame)
@@ -105,7 +111,17 @@ class ClipDataModule(SceneDataModule):
             raise ConfigError(f"data.clip_length is {clip_length}; give 2 to {LONGEST} frames")
         self._shape = ClipShape(clip_length, stride, hop)
         self._folders = SceneFolders(
-            root, train_scenes, test_scenes, val_scenes, format, val_fraction, ground_truth, pgt, on_bad_frame
+            root,
+            train_scenes,
+            test_scenes,
+            val_scenes,
+            format,
+            val_fraction,
+            ground_truth,
+            pgt,
+            on_bad_frame,
+            split,
+            camera,
         )
         self.root = root
         self.train_scenes = train_scenes
@@ -114,6 +130,7 @@ class ClipDataModule(SceneDataModule):
         self.format = format
         self.ground_truth: GroundTruth = ground_truth
         self.pgt = pgt
+        self.camera = camera
         self.clip_length = clip_length
         self.stride = stride
         self.hop = hop
@@ -128,6 +145,7 @@ class ClipDataModule(SceneDataModule):
         self.test_rooms = test_rooms
         self.room_frames = room_frames
         self.on_bad_frame: OnBadFrame = on_bad_frame
+        self.split = split
 
     def _load_scene(self) -> Scene:
         rooms = None

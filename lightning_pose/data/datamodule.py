@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Sequence
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
@@ -17,8 +19,10 @@ from lightning_pose.data.batches import PoseBatch, PoseDataset, make_loader
 from lightning_pose.errors import ConfigError, DataError
 from lightning_pose.features import FeatureCache, FeatureExtractor
 from lightning_pose.features.cache import FillReport
+from lightning_pose.geometry.camera import Camera
 from lightning_pose.paths import cache_folder
-from lightning_pose.scenes.images import read_gray
+from lightning_pose.scenes.cameras import make_camera
+from lightning_pose.scenes.images import read_image_size
 from lightning_pose.scenes.scene import Scene
 from lightning_pose.scenes.synthetic import RENDERER_VERSION, render_room
 
@@ -73,6 +77,7 @@ class SceneDataModule(LightningDataModule):
         self.cache = FeatureCache(extractor, cache_dir)
         self._scene: Scene | None = None
         self._datasets: dict[str, PoseDataset] = {}
+        self._cameras: dict[int, Camera | None] = {}
 
     @abstractmethod
     def _load_scene(self) -> Scene:
@@ -109,11 +114,36 @@ class SceneDataModule(LightningDataModule):
             self._datasets[split] = self._make_dataset(split, self._read(split, self.cache))
         return self._datasets[split]
 
+    def with_extractor(self, extractor: FeatureExtractor) -> SceneDataModule:
+        """The same scene, splits and cache folder with another extractor's features."""
+        other = copy(self)
+        other._scene, other._datasets = self.scene, {}
+        other.extractor, other.cache = extractor, FeatureCache(extractor, self.cache_dir)
+        return other
+
+    def read_features(self, frames: Sequence[int]) -> torch.Tensor:
+        """(M, *input_shape) features of any frames, indices into `Scene.frames`."""
+        return torch.from_numpy(self.cache.features([self.scene.frames[i].image for i in frames], self.workers))
+
     def find_image_size(self, split: str) -> tuple[int, int]:
-        """Width and height of the first image of a split; those of a scene are alike."""
-        first = self.scene.frames[int(self.scene.splits[split][0])]
-        height, width = read_gray(first.image).shape
-        return width, height
+        """Width and height of the first image of a split."""
+        return self.measure_image(int(self.scene.splits[split][0]))
+
+    def measure_image(self, frame: int) -> tuple[int, int]:
+        """Width and height of a frame's image, in pixels."""
+        return read_image_size(self.scene.frames[frame].image)
+
+    def find_camera(self, frame: int) -> Camera | None:
+        """A frame's camera, for its image as it is; None if it is unknown.
+
+        Raises:
+            ConfigError: the camera is for images of another shape.
+        """
+        if frame not in self._cameras:
+            about = self.scene.frames[frame]
+            known = about.intrinsics
+            self._cameras[frame] = known and make_camera(known, *self.measure_image(frame), about.image)
+        return self._cameras[frame]
 
     def _make_dataset(self, split: str, data: PoseBatch) -> PoseDataset:
         """Items of a split, from its frames."""

@@ -35,6 +35,8 @@ class ImageDataModule(SceneDataModule):
         ground_truth: `original`, as the dataset has it; `registered`, moved to the colour camera (7-Scenes); or `sfm`,
             from `pgt`.
         pgt: folder of the pseudo ground truth of Brachmann et al. (ICCV 2021), which holds sfm/7scenes/SCENE_train.txt.
+        camera: of all images, as `MODEL,WIDTH,HEIGHT,PARAMETERS...` in COLMAP's notation, with the centre of the first
+            pixel at (0, 0); such as PINHOLE,640,480,525,525,319.5,239.5. That of the dataset if not given.
         val_fraction: part of the training split kept for validation, in whole blocks of the trajectory; 0 for none.
         batch_size: frames in a training batch.
         eval_batch_size: frames in a batch where no gradient is needed.
@@ -47,6 +49,8 @@ class ImageDataModule(SceneDataModule):
         room_frames: how many frames of it.
         on_bad_frame: `refuse` a scene with frames whose pose or image is missing or useless, or `drop` these frames and
             say how many there are.
+        split: which frames to test on: `every_5` (any number), `folders:NAME,NAME`, `blocks`, or a text file with
+            `IMAGE train|val|test` in each line; the format's own split, or blocks, if not given.
 
     Raises:
         ConfigError: a number is out of its range, scenes are named in two ways, or are in different worlds.
@@ -63,6 +67,7 @@ class ImageDataModule(SceneDataModule):
         format: str | None = None,
         ground_truth: GroundTruth = "original",
         pgt: str | None = None,
+        camera: str | None = None,
         val_fraction: float = 0.1,
         batch_size: int = 64,
         eval_batch_size: int = 256,
@@ -72,10 +77,21 @@ class ImageDataModule(SceneDataModule):
         room_seed: int = 0,
         room_frames: int = 300,
         on_bad_frame: OnBadFrame = "refuse",
+        split: str | None = None,
     ) -> None:
         super().__init__(extractor, batch_size, eval_batch_size, cache_dir, workers)
         self._folders = SceneFolders(
-            root, train_scenes, test_scenes, val_scenes, format, val_fraction, ground_truth, pgt, on_bad_frame
+            root,
+            train_scenes,
+            test_scenes,
+            val_scenes,
+            format,
+            val_fraction,
+            ground_truth,
+            pgt,
+            on_bad_frame,
+            split,
+            camera,
         )
         self.root = root
         self.train_scenes = train_scenes
@@ -84,12 +100,14 @@ class ImageDataModule(SceneDataModule):
         self.format = format
         self.ground_truth: GroundTruth = ground_truth
         self.pgt = pgt
+        self.camera = camera
         self.val_fraction = val_fraction
         self.feature_pool = feature_pool
         self._pool = None if feature_pool is None else _widen_extractor(extractor, feature_pool)
         self.room_seed = room_seed
         self.room_frames = room_frames
         self.on_bad_frame: OnBadFrame = on_bad_frame
+        self.split = split
 
     def _load_scene(self) -> Scene:
         rooms = None

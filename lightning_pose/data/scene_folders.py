@@ -7,8 +7,11 @@ from functools import cache, partial
 from pathlib import Path
 
 from lightning_pose.errors import ConfigError
+from lightning_pose.geometry.camera import Camera
+from lightning_pose.scenes.cameras import apply_camera
 from lightning_pose.scenes.combine import check_one_world, join_scenes
 from lightning_pose.scenes.formats import OnBadFrame, load_scene
+from lightning_pose.scenes.formats.split_rules import check_split_rule
 from lightning_pose.scenes.ground_truth import GroundTruth, apply_ground_truth, check_ground_truth
 from lightning_pose.scenes.scene import Scene
 
@@ -32,6 +35,8 @@ class SceneFolders:
         ground_truth: as for `apply_ground_truth`.
         pgt: likewise.
         on_bad_frame: as for `load_scene`.
+        split: likewise.
+        camera: of all frames, in COLMAP's notation; each format's own if None.
 
     Raises:
         ConfigError: scenes are named in two ways, none to train on is named, or settings contradict each other.
@@ -46,9 +51,15 @@ class SceneFolders:
     ground_truth: GroundTruth = "original"
     pgt: str | None = None
     on_bad_frame: OnBadFrame = "refuse"
+    split: str | None = None
+    camera: str | None = None
 
     def __post_init__(self) -> None:
         check_ground_truth(self.ground_truth, self.pgt)
+        if self.split is not None:
+            check_split_rule(self.split)
+        if self.camera is not None:
+            Camera.parse(self.camera)
         others = {"test_scenes": self.test_scenes, "val_scenes": self.val_scenes}
         if self.root is not None and (self.train_scenes or any(others.values())):
             raise ConfigError(
@@ -97,8 +108,9 @@ class SceneFolders:
         An official test split stays apart even then.
         """
         test_fraction = TEST_FRACTION if tested else 0.0
-        scene = load_scene(folder, self.format, val_fraction, test_fraction, val_block, self.on_bad_frame)
-        return apply_ground_truth(scene, self.ground_truth, self.pgt)
+        scene = load_scene(folder, self.format, val_fraction, test_fraction, val_block, self.on_bad_frame, self.split)
+        scene = apply_ground_truth(scene, self.ground_truth, self.pgt)
+        return scene if self.camera is None else apply_camera(scene, Camera.parse(self.camera))
 
 
 def _resolve_folder(folder: str) -> Path:

@@ -66,7 +66,7 @@ class TestReport(Callback):
         else:
             found = evaluate_images(trainer, pl_module, located, model)
         self.evaluation = found
-        self.results = {type(pl_module).__name__: model, **found.rows, **found.baselines}
+        self.results = {pl_module.system_name: model, **found.rows, **found.baselines}
         scene = scene_datamodule(trainer).scene
         print_results(self.results, f"{scene.name}, {pl_module.headline}", found.extras)
         logger = run_logger(trainer)

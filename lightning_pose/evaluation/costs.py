@@ -14,10 +14,14 @@ from torch import nn
 
 from lightning_pose.data.datamodule import SceneDataModule, scene_datamodule
 from lightning_pose.models.base import PoseModule
+from lightning_pose.models.parts.refinement import MapRefinement
 from lightning_pose.runs.checkpoints import checkpoint_folder
 from lightning_pose.runs.clock import read_train_seconds, wait_for_device
 
 __all__ = ["costs", "count_layers", "measure_weights"]
+
+MOST = 30
+"""Frames whose time is measured."""
 
 
 def costs(
@@ -33,22 +37,27 @@ def costs(
         features: extract a few frames again, to measure how long that takes.
     """
     datamodule = scene_datamodule(trainer)
-    held = datamodule.dataset(split).data.features
+    data = datamodule.dataset(split).data
+    held, refinement = data.features, module.refinement
+    keypoints = None if refinement is None else refinement.read_keypoints(data.frame[: MOST + 1].tolist())
 
     def locate(i: int) -> None:
         shown = held[i : i + 1] if frames == 1 else held[i : i + frames].unsqueeze(0)
         module(shown.to(module.device))
+        if refinement is not None and keypoints is not None:
+            refinement.network.locate(keypoints[i : i + 1])
 
+    keypoint_bytes = 0 if keypoints is None else keypoints[:1].nbytes
     found = {
         "cost/parameters": float(sum(p.numel() for p in module.network.parameters())),
         "cost/carried_numbers": float(sum(tensor.numel() for tensor in module.state_dict().values())),
         "cost/layers": float(count_layers(module.network)),
         "cost/ms_per_frame": _time_median(locate, len(held) - frames + 1) / frames,
-        "cost/frame_bytes": float(math.prod(module.reduced_shape) * held.element_size()),
+        "cost/frame_bytes": float(math.prod(module.reduced_shape) * held.element_size() + keypoint_bytes),
         "cost/weights_bytes": float(measure_weights(module.network)),
     }
     if features:
-        found["cost/features_ms_per_frame"] = _time_features(datamodule, split)
+        found["cost/features_ms_per_frame"] = _time_features(datamodule, split, refinement)
     best = checkpoint_folder(trainer) / "best.ckpt"
     if best.is_file():
         found["cost/checkpoint_bytes"] = float(best.stat().st_size)
@@ -78,14 +87,16 @@ def count_layers(module: nn.Module) -> int:
     return own + sum(count_layers(child) for child in module.children())
 
 
-def _time_features(datamodule: SceneDataModule, split: str) -> float:
-    """Milliseconds to read and extract one frame."""
-    extractor, scene = datamodule.extractor, datamodule.scene
+def _time_features(datamodule: SceneDataModule, split: str, refinement: MapRefinement | None) -> float:
+    """Milliseconds to read one frame and extract what the network reads, and what a map beside it reads."""
+    extractors, scene = [datamodule.extractor], datamodule.scene
+    if refinement is not None and not refinement.extractor.shares_records(datamodule.extractor):
+        extractors.append(refinement.extractor)
     files = [scene.frames[i].image for i in scene.splits[split][:10]]
-    return _time_median(lambda i: extractor.extract([extractor.read(files[i])]), len(files))
+    return _time_median(lambda i: [each.extract([each.read(files[i])]) for each in extractors], len(files))
 
 
-def _time_median(work: Callable[[int], object], count: int, most: int = 30) -> float:
+def _time_median(work: Callable[[int], object], count: int, most: int = MOST) -> float:
     """Median milliseconds of a call with 0, 1, ..., after one that warms up."""
     times = []
     with torch.inference_mode():

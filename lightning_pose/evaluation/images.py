@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import torch
 from lightning import Trainer
@@ -17,13 +18,17 @@ from lightning_pose.evaluation.maps import MapEvaluation, evaluate_map
 from lightning_pose.evaluation.result import Evaluation, skill
 from lightning_pose.figures import images as image_figures
 from lightning_pose.geometry.quaternions import orientation_error_deg, position_error_m
-from lightning_pose.metrics.catalog import reference_baseline
+from lightning_pose.metrics.catalog import MEDIANS, reference_baseline
+from lightning_pose.metrics.summary import summarize_errors
 from lightning_pose.models.base import Pose, PoseModule
 from lightning_pose.models.landmark_map import LandmarkMap
 from lightning_pose.models.parts.poses import Located
 from lightning_pose.scenes.scene import Scene
 
 __all__ = ["evaluate_images"]
+
+ALONE_BATCH = 64
+"""Frames that a refined system's network locates at once."""
 
 
 def evaluate_images(trainer: Trainer, module: PoseModule, located: Located, model: Mapping[str, float]) -> Evaluation:
@@ -50,17 +55,42 @@ def evaluate_images(trainer: Trainer, module: PoseModule, located: Located, mode
         test.position_m,
         test.quat_wxyz,
     )
-    name = type(module).__name__
+    name = module.system_name
     poses = {name: Pose(*(tensor.double() for tensor in prediction)), **baselines}
     frames = [scene.frames[i] for i in test.frame.tolist()]
     metrics = {system: result.metrics for system, result in baselines.items()}
-    on_map = evaluate_map(module, scene, test) if isinstance(module, LandmarkMap) else MapEvaluation({}, {}, {})
+    on_map = _evaluate_map(module, prediction, scene, test)
     return Evaluation(
         baselines=metrics,
         rows=on_map.rows,
         extras=skill(model, metrics[reference_baseline(clips=False)]) | on_map.metrics | costs(trainer, module),
         trajectories={"truth": (frames, Pose(test.position_m, test.quat_wxyz)), "predictions": (frames, prediction)},
         figures=_draw_image_figures(scene, name, train, test, poses) | on_map.figures,
+    )
+
+
+def _evaluate_map(module: PoseModule, prediction: Pose, scene: Scene, test: PoseBatch) -> MapEvaluation:
+    """What only a map has, or a system with one beside it; empty for others."""
+    if isinstance(module, LandmarkMap):
+        answers = module.locate_frames(test)
+        return evaluate_map(module.network, answers, module.world_frame, prediction, scene, test, module.system_name)
+    refinement = module.refinement
+    if refinement is None or not refinement.has_map:
+        return MapEvaluation({}, {}, {})
+    answers = refinement.locate_frames(test.frame.tolist())
+    found = evaluate_map(refinement.network, answers, module.world_frame, prediction, scene, test, module.system_name)
+    alone = _measure_alone(module, test)
+    found.metrics |= {f"test/alone_{name}": alone[name] for name in MEDIANS}
+    return replace(found, rows={**found.rows, f"{type(module).__name__} alone": alone})
+
+
+@torch.inference_mode()
+def _measure_alone(module: PoseModule, test: PoseBatch) -> dict[str, float]:
+    """The errors of a refined system's own network, which is asked again: `test_step` returned refined poses."""
+    parts = [module(features.to(module.device)) for features in test.features.split(ALONE_BATCH)]
+    position, quat = (torch.cat(tensors).cpu().double() for tensors in zip(*parts, strict=True))
+    return summarize_errors(
+        position_error_m(position, test.position_m.double()), orientation_error_deg(quat, test.quat_wxyz.double())
     )
 
 

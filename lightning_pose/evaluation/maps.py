@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from matplotlib.figure import Figure
-from scipy.spatial.transform import Rotation
 
 from lightning_pose.data.batches import PoseBatch
 from lightning_pose.figures import maps as map_figures
 from lightning_pose.geometry.quaternions import orientation_error_deg, position_error_m
 from lightning_pose.mapping.map_localizer import MapAnswer
 from lightning_pose.metrics.summary import summarize_errors
-from lightning_pose.models.landmark_map import LandmarkMap
+from lightning_pose.models.base import Pose
+from lightning_pose.models.parts.map_network import MapNetwork
+from lightning_pose.models.parts.world_frame import WorldFrame
 from lightning_pose.scenes.scene import Scene
 
 __all__ = ["MapEvaluation", "evaluate_map"]
@@ -37,22 +38,33 @@ class MapEvaluation:
 
 
 @torch.inference_mode()
-def evaluate_map(module: LandmarkMap, scene: Scene, test: PoseBatch) -> MapEvaluation:
-    """Locate test frames again: `test_step` returned their poses, without inliers, refusals and radii.
+def evaluate_map(
+    network: MapNetwork,
+    answers: Sequence[MapAnswer],
+    world_frame: WorldFrame,
+    prediction: Pose,
+    scene: Scene,
+    test: PoseBatch,
+    name: str,
+) -> MapEvaluation:
+    """Evaluate what a map says of test frames beside the poses that they got.
 
     Args:
-        module: with a map.
+        network: with a map.
+        answers: of the map for the test frames.
+        world_frame: of the map.
+        prediction: poses of the test frames in the world.
         scene: of the frames.
         test: the frames that were tested, with poses in the world.
+        name: of the system.
     """
-    answers = module.network.locate(test.features)
     truth_m = test.position_m.double().numpy()
-    found_m = to_world(module, np.array([answer.pose.position for answer in answers]))
+    found_m = prediction.position_m.double().numpy()
     position = position_error_m(torch.from_numpy(found_m), torch.from_numpy(truth_m)).numpy()
-    orientation = orientation_error_deg(torch.from_numpy(stack_quats(answers)), test.quat_wxyz.double()).numpy()
+    orientation = orientation_error_deg(prediction.quat_wxyz.double(), test.quat_wxyz.double()).numpy()
     accepted = np.array([answer.accepted for answer in answers])
-    radius, radius_deg = module.network.find_radii(answers)
-    radius_m = radius * module.world_frame.scale
+    radius, radius_deg = network.find_radii(list(answers))
+    radius_m = radius * world_frame.scale
     metrics = {"test/accepted": float(accepted.mean())}
     rows: dict[str, Mapping[str, float]] = {}
     if accepted.any():
@@ -65,18 +77,13 @@ def evaluate_map(module: LandmarkMap, scene: Scene, test: PoseBatch) -> MapEvalu
         metrics["test/coverage_orientation"] = float((orientation <= radius_deg)[accepted].mean())
         metrics["test/radius_median_m"] = float(np.median(radius_m[accepted]))
         metrics["test/radius_median_deg"] = float(np.median(radius_deg[accepted]))
-    point_map = module.network.point_map
-    about = f"LandmarkMap on {scene.name}"
+    about = f"{name} on {scene.name}"
+    point_map = network.point_map
+    points, training = (world_frame.to_world(torch.from_numpy(each)).numpy() for each in (
+        point_map.points, point_map.given_position,
+    ))  # fmt: skip
     figures = {
-        "map": map_figures.draw_map(
-            to_world(module, point_map.points),
-            to_world(module, point_map.given_position),
-            truth_m,
-            found_m,
-            accepted,
-            title=about,
-            unit=scene.unit,
-        ),
+        "map": map_figures.draw_map(points, training, truth_m, found_m, accepted, title=about, unit=scene.unit),
         "error_vs_inliers": map_figures.draw_error_vs_inliers(
             position, np.array([answer.inliers for answer in answers]), accepted, title=about, unit=scene.unit
         ),
@@ -89,14 +96,3 @@ def evaluate_map(module: LandmarkMap, scene: Scene, test: PoseBatch) -> MapEvalu
             unit=scene.unit,
         )
     return MapEvaluation(metrics, rows, figures)
-
-
-def to_world(module: LandmarkMap, position: np.ndarray) -> np.ndarray:
-    """(N, 3) positions of the map in the world."""
-    return module.world_frame.to_world(torch.from_numpy(position)).numpy()
-
-
-def stack_quats(answers: list[MapAnswer]) -> np.ndarray:
-    """(N, 4) wxyz of the answers' poses."""
-    rotations = np.array([answer.pose.rotation for answer in answers])
-    return Rotation.from_matrix(rotations).as_quat(scalar_first=True)

@@ -58,6 +58,11 @@ class FeatureExtractor(ABC):
     def feature_shape(self) -> tuple[int, ...]:
         """Shape of one image's features as the networks read them."""
 
+    def shares_records(self, other: FeatureExtractor) -> bool:
+        """Whether another extractor computes the same records, of which it may read another part."""
+        ours, theirs = ((e.name, e.version, dict(e.settings)) for e in (self, other))
+        return type(self) is type(other) and ours == theirs
+
     def read(self, path: str | Path) -> np.ndarray:
         """Read an image file as `extract` takes it.
 

@@ -91,6 +91,19 @@ class Camera:
             distortion = distortion[:4]
         return cls(int(width), int(height), fx, fy, found["cx"], found["cy"], distortion, fisheye)
 
+    def __str__(self) -> str:
+        """COLMAP's notation, as `parse` reads it.
+
+        >>> print(Camera.parse("SIMPLE_RADIAL,640,480,500,320,240,0.1"))
+        OPENCV,640,480,500,500,320,240,0.1,0,0,0
+        """
+        name = "OPENCV_FISHEYE" if self.fisheye else "PINHOLE" if not self.distortion else "FULL_OPENCV"
+        name = "OPENCV" if name == "FULL_OPENCV" and not any(self.distortion[4:]) else name
+        count = len(CAMERA_MODELS[name].split()) - 4
+        distortion = (*self.distortion, *[0.0] * count)[:count]
+        numbers = (self.width, self.height, self.fx, self.fy, self.cx, self.cy, *distortion)
+        return ",".join([name, *(f"{number:.10g}" for number in numbers)])
+
     @property
     def focal_px(self) -> float:
         """The mean focal length, for thresholds in pixels."""
@@ -129,3 +142,19 @@ class Camera:
         else:
             found = cv2.undistortPoints(flat, matrix, coefficients, criteria=ITERATIONS)
         return found.reshape(pixels.shape)
+
+    def project(self, points: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
+        """Pixels of normalised image coordinates: the inverse of `normalize`."""
+        matrix = np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
+        if not self.distortion or not points.size:
+            return points * [self.fx, self.fy] + [self.cx, self.cy]
+        flat, nowhere, coefficients = (
+            points.reshape(-1, 1, 2).astype(np.float64),
+            np.zeros(3),
+            np.array(self.distortion),
+        )
+        if self.fisheye:
+            pixels = cv2.fisheye.distortPoints(flat, matrix, coefficients)
+        else:
+            pixels = cv2.projectPoints(cv2.convertPointsToHomogeneous(flat), nowhere, nowhere, matrix, coefficients)[0]
+        return pixels.reshape(points.shape)

@@ -10,10 +10,14 @@ import numpy as np
 import torch
 
 from lightning_pose.checkpoint import build_object, check_specs, read_checkpoint
-from lightning_pose.errors import CheckpointError
-from lightning_pose.features.base import FeatureExtractor
+from lightning_pose.errors import CheckpointError, ConfigError
+from lightning_pose.features.base import FeatureExtractor, Record
+from lightning_pose.geometry.camera import Camera
 from lightning_pose.geometry.relative import RelativeFrame
 from lightning_pose.localization.sequences import locate_sequence
+from lightning_pose.models.parts.answers import Answers, answer_by_network
+from lightning_pose.models.parts.poses import Pose
+from lightning_pose.scenes.images import to_gray
 
 if TYPE_CHECKING:
     from lightning_pose.models import PoseModule
@@ -64,32 +68,58 @@ class Localizer:
         return cls(build_object(data["extractor"], allow, "lightning_pose.features"), model, clips)
 
     def __call__(
-        self, images: str | Path | np.ndarray | Sequence[str | Path | np.ndarray]
+        self,
+        images: str | Path | np.ndarray | Sequence[str | Path | np.ndarray],
+        camera: str | Camera | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Locate images.
 
         Args:
             images: M files, or uint8 arrays as `extractor.color` asks for: (H, W) gray or (H, W, 3) RGB. One image
                 may stand alone, and is a list of one.
+            camera: of all images, scaled to each, for systems with a map; in COLMAP's notation, as `data.camera` has
+                it. That of the training images if not given.
 
         Returns:
             position_m (M, 3) and quat_wxyz (M, 4), camera-to-world. For a model of clips the images are one video, in
             order, and the world is the first camera.
 
         Raises:
+            ConfigError: the camera is not understood, not used, or for images of another shape.
             ImageError: an image cannot be read.
         """
+        answers = self.locate(images, camera)
+        return answers.position_m, answers.quat_wxyz
+
+    def locate(
+        self,
+        images: str | Path | np.ndarray | Sequence[str | Path | np.ndarray],
+        camera: str | Camera | None = None,
+    ) -> Answers:
+        """As a call, and say of each pose what it comes from, and how sure it is."""
+        camera = Camera.parse(camera) if isinstance(camera, str) else camera
         extractor, axes = self.extractor, 2 if self.extractor.color == "gray" else 3
         if isinstance(images, str | Path) or (isinstance(images, np.ndarray) and images.ndim == axes):
             images = [images]
         arrays = [image if isinstance(image, np.ndarray) else extractor.read(image) for image in images]
         if not arrays:
-            return np.zeros((0, 3), np.float32), np.zeros((0, 4), np.float32)
+            return answer_by_network(Pose(torch.zeros(0, 3), torch.zeros(0, 4)))
         records = extractor.extract(arrays)
-        features = torch.from_numpy(np.stack([extractor.features(record) for record in records]))
+        features = _stack_features(extractor, records)
         if self.clips is not None:
-            chained = locate_sequence(self.model, features, *self.clips)
-            return chained[0].numpy(), chained[1].numpy()
+            if camera is not None:
+                raise ConfigError(f"{type(self.model).__name__} does not use cameras; leave camera out")
+            return answer_by_network(Pose(*locate_sequence(self.model, features, *self.clips)[:2]))
+        keypoints = None
+        if self.model.refinement is not None:
+            of_map = self.model.refinement.extractor
+            if not of_map.shares_records(extractor):
+                records = of_map.extract([to_gray(array) for array in arrays])
+            keypoints = _stack_features(of_map, records)
         with torch.inference_mode():
-            pose = self.model(features)
-        return pose.position_m.numpy(), pose.quat_wxyz.numpy()
+            return self.model.locate_images(features, [array.shape[1::-1] for array in arrays], camera, keypoints)
+
+
+def _stack_features(extractor: FeatureExtractor, records: Sequence[Record]) -> torch.Tensor:
+    """(M, *feature_shape) of M records."""
+    return torch.from_numpy(np.stack([extractor.features(record) for record in records]))

@@ -63,7 +63,8 @@ def match_pairs(frames: MapFrames, pairs: np.ndarray, band_px: float = BAND_PX) 
     essential = essential_matrices(frames.rotation[a], frames.position[a], frames.rotation[b], frames.position[b])
     rays = torch.from_numpy(np.concatenate([frames.points, np.ones_like(frames.points[..., :1])], axis=2)).float()
     descriptors = torch.from_numpy(frames.descriptors)
-    log_size = torch.from_numpy(np.where(frames.real, np.log2(np.maximum(frames.size_px, 1e-6)), np.inf)).float()
+    size = np.maximum(frames.size_px / frames.focal_px[:, None], 1e-9)  # an angle: images may differ in size
+    log_size = torch.from_numpy(np.where(frames.real, np.log2(size), np.inf)).float()
     band = torch.from_numpy(band_px / frames.focal_px).float()
     found: list[tuple[np.ndarray, ...]] = []
     for start in range(0, len(pairs), BATCH):

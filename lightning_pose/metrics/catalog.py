@@ -11,6 +11,7 @@ __all__ = [
     "ERRORS",
     "MAP",
     "MEDIANS",
+    "REFINED",
     "SKILLS",
     "TRAJECTORY",
     "Baseline",
@@ -104,6 +105,12 @@ MAP = {
 }
 """Of systems with a landmark map, beside their errors: `test/NAME`."""
 
+REFINED = {
+    "alone_position_median_m": Metric("median position error without the map", "m", form=".3f"),
+    "alone_orientation_median_deg": Metric("median orientation error without the map", "°", form=".2f"),
+}
+"""Of systems that a map refines, beside those of `MAP`: `test/NAME`."""
+
 TRAJECTORY = {
     "ate_rmse_m": Metric("absolute trajectory error, aligned", "m"),
     "ate_origin_rmse_m": Metric("absolute trajectory error from the first pose", "m"),
@@ -169,7 +176,7 @@ def reference_baseline(clips: bool) -> str:
 
 def find_metric(name: str) -> Metric | None:
     """The entry of a metric by its name in MLflow, such as `test/position_median_m`; None for an unknown one."""
-    return (ERRORS | SKILLS | MAP | TRAJECTORY | CURVES | COSTS).get(name.rpartition("/")[2])
+    return (ERRORS | SKILLS | MAP | REFINED | TRAJECTORY | CURVES | COSTS).get(name.rpartition("/")[2])
 
 
 def format_number(value: float) -> str:

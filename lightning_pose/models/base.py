@@ -17,9 +17,10 @@ from lightning_pose.geometry.quaternions import align_hemisphere, quat_normalize
 from lightning_pose.losses import LossConfig, PoseLoss
 from lightning_pose.metrics.item_means import ItemMeans, key_items, key_poses
 from lightning_pose.metrics.pose_metrics import PoseMetrics
-from lightning_pose.models.parts.checkpoint_hooks import CheckpointHooks
 from lightning_pose.models.parts.divergence import DivergenceWatch
 from lightning_pose.models.parts.poses import Located, Pose, check_features, check_poses
+from lightning_pose.models.parts.refined_module import RefinedModule
+from lightning_pose.models.parts.refinement import MapSettings
 from lightning_pose.models.parts.schedule import cosine_factor
 from lightning_pose.models.parts.standardization import StandardizedModule
 from lightning_pose.models.parts.world_frame import WorldFrame
@@ -32,7 +33,7 @@ Stage = Literal["train", "val", "test"]
 warnings.filterwarnings("ignore", message=".*overridden `on_before_batch_transfer` in `LightningModule`")
 
 
-class PoseModule(CheckpointHooks, StandardizedModule):
+class PoseModule(RefinedModule, StandardizedModule):
     """Base class of the architectures.
 
     To add one, subclass it in a file of its own, call `super().__init__(**kwargs)` first, and set `input_ranks` and
@@ -53,6 +54,7 @@ class PoseModule(CheckpointHooks, StandardizedModule):
     | `reduced_shape` | seldom | the shape of a frame's features once a fixed projection has reduced them |
     | `training_splits` | seldom | the splits whose poses end up in the weights |
     | `memory` | seldom | with `TrainingMemory`: what the checkpoint carries of every training frame |
+    | `locate_images` | seldom | answers for images whose size, and perhaps camera, are known |
     | `reads_clips`, `check_data`, `training_poses`, `select_judged` | for clips | see `ClipModule` |
 
     With `standardize`, the seven numbers are in standard deviations around the mean training pose; otherwise they are
@@ -73,6 +75,8 @@ class PoseModule(CheckpointHooks, StandardizedModule):
         standardize: let the network predict in standard deviations around the mean training pose.
         standardize_features: let the network read each column of the features in standard deviations around its
             mean over the training frames. Descriptors have unit length, so that their elements are small.
+        refine: build a landmark map of the same frames, whose pose a frame has where the map accepts it; `true`, or
+            settings of the map.
 
     Raises:
         ConfigError: `input_shape` does not suit the architecture, or a rate is out of its range.
@@ -92,6 +96,7 @@ class PoseModule(CheckpointHooks, StandardizedModule):
         schedule: Literal["constant", "cosine"] = "cosine",
         standardize: bool = True,
         standardize_features: bool = True,
+        refine: bool | MapSettings = False,
     ) -> None:
         super().__init__()
         loss = LossConfig(**loss) if isinstance(loss, dict) else loss or LossConfig()
@@ -119,6 +124,7 @@ class PoseModule(CheckpointHooks, StandardizedModule):
         self.val_metrics, self.val_losses = PoseMetrics(), ItemMeans()
         self.test_metrics, self.test_losses = PoseMetrics(), ItemMeans()
         self.register_scales()
+        self.register_refinement(refine)
 
     @property
     def headline(self) -> str:
@@ -175,6 +181,7 @@ class PoseModule(CheckpointHooks, StandardizedModule):
         datamodule = scene_datamodule(self.trainer) if stage == "fit" else find_datamodule(self.trainer)
         if datamodule is not None:
             self.check_data(datamodule)
+        self.attach_refinement(datamodule)
         if datamodule is not None and stage == "fit":
             train = datamodule.dataset("train")
             for split in self.training_splits:
@@ -228,7 +235,7 @@ class PoseModule(CheckpointHooks, StandardizedModule):
         """The poses, in the world, of a batch of validation or test, with their errors and losses collected."""
         terms, position, quat_raw = self._compare(batch, by_item=True)
         to_world = self.world_frame.to_world
-        pose = Pose(to_world(position), quat_normalize(quat_raw))
+        pose = self.refine_pose(batch.frame, Pose(to_world(position), quat_normalize(quat_raw)))
         check_poses(Located(batch.frame, *pose), type(self).__name__, self._remedy)
         losses.update(terms, key_items(batch.frame))
         keys = key_poses(batch.frame)
@@ -257,7 +264,7 @@ class PoseModule(CheckpointHooks, StandardizedModule):
         return Located(batch.frame, *self._judge_step(batch, self.test_metrics, self.test_losses))
 
     def predict_step(self, batch: PoseBatch, batch_idx: int) -> Located:
-        pose = self(batch.features)
+        pose = self.refine_pose(batch.frame, self(batch.features))
         check_poses(Located(batch.frame, *pose), type(self).__name__, self._remedy)
         return Located(batch.frame, *pose)
 
@@ -273,6 +280,7 @@ class PoseModule(CheckpointHooks, StandardizedModule):
         Raises:
             ConfigError: it has.
         """
+        self.refit_refinement()
         self.divergence.check_epoch(self._remedy)
         self.divergence.check_weights(self.parameters(), self._remedy)
 

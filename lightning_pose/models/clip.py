@@ -42,6 +42,7 @@ class ClipModule(PoseModule):
 
     input_ranks: ClassVar[tuple[int, ...]] = (2, 3)
     reads_clips: ClassVar[bool] = True
+    refusal: ClassVar[str] = "returns poses relative to a clip's first frame, where a map's are in the world"
 
     motion_scale: Tensor
 

@@ -2,27 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal, cast
+from collections.abc import Sequence
+from typing import Any, ClassVar, cast
 
-import numpy as np
 import torch
 from lightning.pytorch.core.optimizer import LightningOptimizer
-from scipy.spatial.transform import Rotation
+from torch import Tensor
 
 from lightning_pose.data.batches import PoseBatch
 from lightning_pose.data.datamodule import SceneDataModule, scene_datamodule
-from lightning_pose.errors import ConfigError, DataError
-from lightning_pose.features.base import LocalExtractor
 from lightning_pose.geometry.camera import Camera
-from lightning_pose.mapping.build_map import MappedFrames, adjust_mapped, map_frames, summarize_tracks
-from lightning_pose.mapping.calibration import UNKNOWN, calibrate_map, measure_frames
-from lightning_pose.mapping.conventions import fit_focal_length
-from lightning_pose.mapping.frame_matches import match_nearby_frames
-from lightning_pose.mapping.frames import MapFrames
-from lightning_pose.mapping.map_localizer import MapLocalizer
+from lightning_pose.geometry.quaternions import quat_normalize
+from lightning_pose.mapping.map_localizer import MapAnswer
 from lightning_pose.models.base import PoseModule
-from lightning_pose.models.parts.map_network import MAP_SHAPES, MapNetwork, keypoints_to_frames
+from lightning_pose.models.parts.answers import Answers, answer_by_map, convert_answers
+from lightning_pose.models.parts.frame_cameras import list_cameras, scale_cameras
+from lightning_pose.models.parts.map_builder import BundleAdjust, MapBuilder, check_bundle_adjust, check_keypoints
+from lightning_pose.models.parts.map_network import MAP_SHAPES, MapNetwork
 from lightning_pose.models.parts.memory import TrainingMemory
+from lightning_pose.models.parts.poses import Located
 
 __all__ = ["LandmarkMap"]
 
@@ -33,10 +31,10 @@ class LandmarkMap(TrainingMemory, PoseModule):
     Not in the thesis: its features are those of SurfCNN and SurfLSTM with their places in the image. One pass over
     the training frames builds the map; there is nothing to train in steps.
 
+    Each frame has its own camera: the dataset's, or `data.camera`. Where none is known, all have the focal length that
+    fits the training poses best.
+
     Args:
-        camera: `MODEL,WIDTH,HEIGHT,PARAMETERS...` in COLMAP's notation, such as `PINHOLE,640,480,525,525,320,240`, for
-            images that carry none; the centre of the first pixel is (0, 0). Without it, the dataset's camera is used,
-            and if it has none, the focal length that fits the poses best.
         bundle_adjust: `true` moves the training poses until they agree with the images, and carries answers back to
             the given poses; `auto` does so if validation frames (without them, training frames left out in turn) are
             located better; `false` takes the poses as they are.
@@ -45,18 +43,18 @@ class LandmarkMap(TrainingMemory, PoseModule):
         **kwargs: what `PoseModule` takes. `loss` is only logged; learning rate, decay and schedule are ignored.
 
     Raises:
-        ConfigError: `camera` or `bundle_adjust` is not understood; in `setup`, the features are not keypoints
-            with their geometry.
+        ConfigError: `bundle_adjust` is not understood; in `setup`, the features are not keypoints with their
+            geometry.
     """
 
     input_ranks: ClassVar[tuple[int, ...]] = (2,)
+    refusal: ClassVar[str] = "is a map itself"
     memory: ClassVar[tuple[str, ...]] = tuple(f"network.{name}" for name in MAP_SHAPES if name != "camera")
     network: MapNetwork
 
     def __init__(
         self,
-        camera: str | None = None,
-        bundle_adjust: bool | Literal["auto"] = "auto",
+        bundle_adjust: BundleAdjust = "auto",
         refit: bool = True,
         standardize: bool = False,
         standardize_features: bool = False,
@@ -64,13 +62,10 @@ class LandmarkMap(TrainingMemory, PoseModule):
     ) -> None:
         super().__init__(standardize=standardize, standardize_features=standardize_features, **kwargs)
         self.automatic_optimization = False
-        self.camera = None if camera is None else Camera.parse(camera)
-        if bundle_adjust not in (True, False, "auto"):
-            raise ConfigError(f"bundle_adjust is {bundle_adjust!r}; give true, false or auto")
-        self.bundle_adjust = bundle_adjust
+        check_bundle_adjust(bundle_adjust)
+        self.bundle_adjust: BundleAdjust = bundle_adjust
         self.refit = refit
         self.network = MapNetwork(self.input_shape[1] - 4)
-        self._adjusts = bundle_adjust is True
 
     @property
     def headline(self) -> str:
@@ -83,13 +78,7 @@ class LandmarkMap(TrainingMemory, PoseModule):
     def check_data(self, datamodule: SceneDataModule) -> None:
         """Also refuse features that are no keypoints, or come without their places in the image."""
         super().check_data(datamodule)
-        extractor = datamodule.extractor
-        if not isinstance(extractor, LocalExtractor) or not extractor.with_geometry:
-            raise ConfigError(
-                f"LandmarkMap needs keypoints with their places, and {extractor.name} features have none; "
-                "choose lightning_pose.features.SURF (or SIFT, ORB, FREAK, BRIEF), and set "
-                "data.extractor.with_geometry: true"
-            )
+        check_keypoints(datamodule.extractor)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         # There is nothing to step along, but Lightning writes no checkpoint before some optimizer has stepped.
@@ -97,7 +86,8 @@ class LandmarkMap(TrainingMemory, PoseModule):
 
     def training_step(self, batch: PoseBatch, batch_idx: int) -> None:
         if self.trainer.is_last_batch:  # before the validation that closes the epoch
-            self._build(("train",), calibrate=not self._refits)
+            self._builder = self._make_builder()
+            self._builder.build(("train",), calibrate=not self._refits)
             cast(LightningOptimizer, self.optimizers()).step()
 
     @torch.no_grad()
@@ -105,7 +95,7 @@ class LandmarkMap(TrainingMemory, PoseModule):
         # Validation is over, and checkpoints are not written yet.
         datamodule = scene_datamodule(self.trainer)
         if self._refits:
-            self._build(("train", "val"), calibrate=True)
+            self._builder.build(("train", "val"), calibrate=True)
         train = datamodule.dataset("train")
         sample = list(range(0, len(train), max(1, len(train) // 50)))
         batch = self.localize_batch(train.__getitems__(sample))
@@ -118,91 +108,35 @@ class LandmarkMap(TrainingMemory, PoseModule):
         """Whether the map is built again with validation frames."""
         return self.refit and len(scene_datamodule(self.trainer).scene.splits["val"]) > 0
 
-    def _build(self, splits: tuple[str, ...], calibrate: bool) -> None:
-        """Build the map of the frames of these splits; unless it is only to be validated, find its radii too.
-
-        Raises:
-            DataError: the frames give no point.
-        """
+    def _make_builder(self) -> MapBuilder:
         datamodule = scene_datamodule(self.trainer)
-        camera = self._find_camera(datamodule)
-        frames = self._read_frames(datamodule, splits, camera)
-        mapped = map_frames(frames, adjust=False)
-        if self.bundle_adjust is not False:
-            mapped = self._choose_adjusted(mapped, datamodule, camera, decided=splits != ("train",))
-        if not len(mapped.tracks.points):
-            raise DataError(
-                f"no point of {datamodule.scene.root} could be triangulated from {len(frames)} frames; "
-                "`python -m lightning_pose check` says whether the poses fit the images"
-            )
-        point_map, calibration = summarize_tracks(mapped), calibrate_map(mapped) if calibrate else UNKNOWN
-        self.network.set_map(point_map, camera, calibration)
-        if calibrate:
-            error_m = calibration.position_error * self.world_frame.scale
-            self.print(
-                f"map of {len(frames)} frames: {len(point_map)} points, {point_map.n_bytes / 1e6:.1f} MB, "
-                f"bundle adjustment {'on' if self._adjusts else 'off'}; training frames left out in turn are located "
-                f"to {error_m:.3g} {datamodule.scene.unit} and {calibration.orientation_error_deg:.2f} degrees (median)"
-            )
+        return MapBuilder(self.network, datamodule, self.world_frame, self.bundle_adjust, self.print)
 
-    def _choose_adjusted(
-        self, mapped: MappedFrames, datamodule: SceneDataModule, camera: Camera, decided: bool
-    ) -> MappedFrames:
-        """The map after bundle adjustment, or as it was where that locates validation frames better."""
-        if self.bundle_adjust == "auto" and decided and not self._adjusts:
-            return mapped
-        adjusted = adjust_mapped(mapped)
-        if self.bundle_adjust == "auto" and not decided:
-            if len(datamodule.scene.splits["val"]):
-                val = self._read_frames(datamodule, ("val",), camera)
-                before, after = (
-                    np.median(measure_frames(MapLocalizer(summarize_tracks(each)), val).position)
-                    for each in (mapped, adjusted)
-                )
-            else:
-                before, after = (calibrate_map(each).position_error for each in (mapped, adjusted))
-            self._adjusts = bool(after < before)
-        return adjusted if self._adjusts else mapped
+    def decode_batch(self, batch: PoseBatch) -> tuple[Tensor, Tensor]:
+        """As `decode_features`, each frame with its own camera."""
+        features = self.standardize_input(batch.features)
+        return self.unscale_pose(self.network(features, self._list_cameras(batch.frame)))
 
-    def _read_frames(self, datamodule: SceneDataModule, splits: tuple[str, ...], camera: Camera) -> MapFrames:
-        """Keypoints and given poses of the frames of these splits, in the order of the scene."""
-        data = [datamodule.dataset(split).data for split in splits]
-        index = torch.cat([part.frame for part in data])
-        order = index.argsort()
-        frames = [datamodule.scene.frames[i] for i in index[order].tolist()]
-        quats = np.array([frame.quat_wxyz for frame in frames])
-        return keypoints_to_frames(
-            torch.cat([part.features for part in data])[order],
-            camera,
-            Rotation.from_quat(quats, scalar_first=True).as_matrix(),
-            self.world_frame.to_local(torch.from_numpy(np.array([frame.position_m for frame in frames]))).numpy(),
-        )
+    def predict_step(self, batch: PoseBatch, batch_idx: int) -> Located:
+        position, quat = self.decode_batch(batch)
+        return Located(batch.frame, self.world_frame.to_world(position), quat_normalize(quat))
 
-    def _find_camera(self, datamodule: SceneDataModule) -> Camera:
-        """The camera of the setting, of the dataset, or with the focal length that fits the training poses."""
-        scene = datamodule.scene
-        first = scene.frames[int(scene.splits["train"][0])]
-        width, height = datamodule.find_image_size("train")
-        if self.camera is not None:
-            return self.camera.resize(width, height)
-        if first.intrinsics is not None:
-            known = first.intrinsics.for_size(width, height)
-            return Camera(width, height, known.fx, known.fy, known.cx, known.cy, known.distortion)
-        guess = Camera(width, height, 1.0, 1.0, (width - 1) / 2, (height - 1) / 2)
-        frames = self._read_frames(datamodule, ("train",), guess)
-        sequences = [scene.frames[i].sequence for i in datamodule.dataset("train").data.frame.tolist()]
-        matches = match_nearby_frames(
-            sequences,
-            lambda i: (frames.points[i, : frames.count[i]], frames.descriptors[i, : frames.count[i]]),
-        )
-        _, residual_px, focal_px = fit_focal_length(matches, frames.rotation, frames.position, max(width, height))
-        if not np.isfinite(residual_px):
-            raise ConfigError(
-                f"the camera of {scene.root} is unknown, and its frames do not tell the focal length (too few matches, "
-                "or no motion); give model.camera, such as PINHOLE,640,480,525,525,320,240"
-            )
-        self.print(
-            f"the camera is unknown: a focal length of {focal_px:.0f} px fits the poses best (matches lie "
-            f"{residual_px:.2f} px off their epipolar lines); model.camera sets another"
-        )
-        return Camera(width, height, focal_px, focal_px, (width - 1) / 2, (height - 1) / 2)
+    def locate_frames(self, batch: PoseBatch) -> list[MapAnswer]:
+        """What the map says of frames of the trainer's data module, in the map's own unit."""
+        return self.network.locate(batch.features, self._list_cameras(batch.frame))
+
+    def locate_images(
+        self,
+        features: Tensor,
+        sizes: Sequence[tuple[int, int]],
+        camera: Camera | None = None,
+        keypoints: Tensor | None = None,
+    ) -> Answers:
+        """As any system, with the reason where the map refuses; `keypoints` are the features themselves."""
+        cameras = scale_cameras(self.network.view if camera is None else camera, sizes)
+        found = self.network.locate(features, cameras)
+        return answer_by_map(convert_answers(found, self.world_frame), found, self.network, self.world_frame.scale)
+
+    def _list_cameras(self, frames: Tensor) -> list[Camera]:
+        """The cameras of frames of the trainer's data module; those of unknown ones are the map's."""
+        return list_cameras(scene_datamodule(self.trainer), frames.tolist(), self.network.view)

@@ -91,7 +91,7 @@ class Run:
 
     @property
     def system(self) -> str:
-        return self.tags.get("architecture", "unknown")
+        return self.tags.get("architecture", "unknown") + " refined" * ("refined" in self.tags)
 
     @property
     def scene(self) -> str:

@@ -63,7 +63,7 @@ class RunRecorder(Callback):
         scene, seed = scene_datamodule(trainer).scene.name, read_seed()
         trial = kept.tags.get("sweep.trial")
         parts = (
-            f"{type(module).__name__} {scene} {module.headline}",
+            f"{module.system_name} {scene} {module.headline}",
             f"seed={seed}" if seed else "",
             "" if stage == "fit" else "(test)",
         )
@@ -85,6 +85,7 @@ class RunRecorder(Callback):
             "ground_truth": scene.ground_truth,
             "unit": scene.unit,
             "features": datamodule.extractor.name,
+            **({"refined": "true"} if module.refinement is not None else {}),
             **_test_tags(datamodule, module),
         }
         commit = _read_git_commit()

@@ -14,7 +14,7 @@ from lightning_pose.runs.tags import OPERATIONAL
 
 __all__ = ["PLACES", "check_architecture", "check_resumable", "check_same_settings", "is_complete", "read_seed"]
 
-PLACES = ("root", "train_scenes", "test_scenes", "format")
+PLACES = ("root", "train_scenes", "test_scenes", "val_scenes", "pgt", "format")
 """Settings of the data that say where it is; a dataset may have moved since the run began."""
 
 

@@ -10,10 +10,21 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from PIL import Image
 
 from lightning_pose.errors import ImageError
 
-__all__ = ["ImageFacts", "decode_image", "find_bits", "measure_image", "read_bytes", "read_gray", "read_rgb", "to_gray"]
+__all__ = [
+    "ImageFacts",
+    "decode_image",
+    "find_bits",
+    "measure_image",
+    "read_bytes",
+    "read_gray",
+    "read_image_size",
+    "read_rgb",
+    "to_gray",
+]
 
 log = logging.getLogger("lightning_pose")
 
@@ -71,6 +82,20 @@ def read_rgb(path: Path | str) -> np.ndarray:
         ImageError: as `read_gray`.
     """
     return _read_image(path, color=True)
+
+
+def read_image_size(path: Path | str) -> tuple[int, int]:
+    """Width and height of an image file, in pixels as stored; of usual formats only the head is read.
+
+    Raises:
+        ImageError: as `read_gray`.
+    """
+    try:
+        with Image.open(path) as image:
+            return image.size
+    except (OSError, ValueError, Image.DecompressionBombError):  # OpenCV may read it all the same
+        height, width = read_gray(path).shape
+        return width, height
 
 
 def read_bytes(path: Path | str) -> bytes:

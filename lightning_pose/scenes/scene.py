@@ -23,7 +23,8 @@ class Intrinsics:
         cx: principal point.
         cy: principal point.
         size: width and height of the images that the numbers are for; None for the images as they are.
-        distortion: OpenCV's coefficients k1 k2 p1 p2 k3 ...; empty for none.
+        distortion: OpenCV's coefficients k1 k2 p1 p2 k3 ..., or with `fisheye` k1 k2 k3 k4; empty for none.
+        fisheye: whether the distortion is that of a fisheye lens (equidistant).
     """
 
     fx: float
@@ -32,6 +33,7 @@ class Intrinsics:
     cy: float
     size: tuple[int, int] | None = None
     distortion: tuple[float, ...] = ()
+    fisheye: bool = False
 
     def for_size(self, width: int, height: int) -> Intrinsics:
         """The same camera for images that were resized to this size."""
@@ -39,7 +41,7 @@ class Intrinsics:
             return self
         x, y = width / self.size[0], height / self.size[1]
         cx, cy = (self.cx + 0.5) * x - 0.5, (self.cy + 0.5) * y - 0.5
-        return Intrinsics(self.fx * x, self.fy * y, cx, cy, (width, height), self.distortion)
+        return Intrinsics(self.fx * x, self.fy * y, cx, cy, (width, height), self.distortion, self.fisheye)
 
 
 @dataclass(frozen=True)
@@ -76,7 +78,7 @@ class Scene:
         frames: every frame; those of one sequence are consecutive and in order.
         splits: frame indices of each of `SPLITS`; disjoint.
         split_source: `official` if the dataset has a split, `blocks` if the trajectory was cut into blocks, `unseen` if
-            no frame of the test scenes is trained on.
+            no frame of the test scenes is trained on; otherwise the user's rule, as in `apply_split_rule`.
         unit: unit of the positions: `m`, or `scene` if the scale is arbitrary.
         ground_truth: where the poses come from (`original`, `sfm`, `synthetic`, ...).
         bad_frames: what is wrong with each frame that the dataset lists and that is not in `frames`; each text begins

@@ -45,7 +45,7 @@ def make_splits(
     """Ascending frame indices of `train`, `val` and `test`, disjoint.
 
     Args:
-        scene: with the official `train` and `test` in `splits`, or with empty `splits`.
+        scene: with the official `train` and `test` in `splits`, perhaps with `val`, or with empty `splits`.
         val_fraction: part of the training frames to validate on; 0 leaves `val` empty.
         test_fraction: part of all frames to test on, if the scene has no official split.
         val_block: see `hold_out`.
@@ -62,6 +62,8 @@ def make_splits(
         train, test = scene.splits["train"], scene.splits["test"]
     else:
         train, test = hold_out(np.arange(len(sequences)), sequences, test_fraction, "test_fraction", runs=runs)
+    if "val" in scene.splits:
+        return {"train": train, "val": scene.splits["val"], "test": test}
     train, val = hold_out(train, sequences, val_fraction, "val_fraction", val_block, runs)
     return {"train": train, "val": val, "test": test}
 

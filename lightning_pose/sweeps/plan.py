@@ -28,7 +28,11 @@ __all__ = ["MEASURES", "Objective", "Plan", "read_plan"]
 FIELDS = ("base", "objective", "sampler", "pruner", "n_trials", "seed", "settings", "space", "measure", "figure")
 COSTS = tuple(f"cost/{name}" for name, cost in catalog.COSTS.items() if cost.objective)
 MEASURED = ("val/loss", *(f"val/{name}" for name in catalog.ERRORS))
-SCENES = ("data.root", "data.train_scenes", "data.test_scenes", "data.room_seed", "data.train_rooms", "data.test_rooms")
+SCENES = (
+    "data.root", "data.train_scenes", "data.test_scenes", "data.val_scenes", "data.ground_truth", "data.pgt",
+    "data.room_seed", "data.train_rooms", "data.test_rooms",
+)  # fmt: skip
+"""What decides which frames a trial is judged on, and by which truth."""
 FEATURES = ("features/count_median", "features/count_mean")
 
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
+from lightning_pose.errors import ConfigError
 from lightning_pose.geometry.camera import CAMERA_MODELS, Camera
 
 RAYS = np.random.default_rng(0).uniform([-0.5, -0.4], [0.5, 0.4], (60, 2))
@@ -41,6 +44,16 @@ def project(camera: Camera) -> np.ndarray:
 def test_pixels_of_known_rays_give_the_rays_back(model: str) -> None:
     camera = Camera.parse(f"{model},640,480,{EXAMPLES[model]}")
     np.testing.assert_allclose(camera.normalize(project(camera)), RAYS, atol=1e-9)
+    np.testing.assert_allclose(camera.project(RAYS), project(camera), atol=1e-9)
+    assert Camera.parse(str(camera)) == replace(camera, distortion=Camera.parse(str(camera)).distortion)
+    np.testing.assert_allclose(Camera.parse(str(camera)).project(RAYS), project(camera), atol=1e-9)
+
+
+def test_the_first_pixel_is_at_the_origin() -> None:
+    """A camera of two by two pixels that looks at the corner that all four share."""
+    camera = Camera.parse("SIMPLE_PINHOLE,2,2,1,0.5,0.5")
+    np.testing.assert_array_equal(camera.normalize(np.array([[0.0, 0.0], [0.5, 0.5], [1.0, 1.0]])).mean(0), [0, 0])
+    np.testing.assert_array_equal(camera.resize(4, 4).project(np.zeros((1, 2))), [[1.5, 1.5]])
 
 
 def test_a_resized_image_shows_the_same_rays() -> None:
@@ -57,3 +70,17 @@ def test_lower_case_and_spaces_are_read() -> None:
 
 def test_no_pixels_give_no_rays() -> None:
     assert Camera.parse("OPENCV,640,480," + EXAMPLES["OPENCV"]).normalize(np.zeros((0, 2))).shape == (0, 2)
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("PINHOLE,640,480,500,500,320", "does not have the form PINHOLE,WIDTH,HEIGHT,FX,FY,CX,CY"),
+        ("LENS,640,480,500", "'LENS' is no camera model; give one of SIMPLE_PINHOLE"),
+        ("PINHOLE,640,480,0,500,320,240", "focal lengths must be above 0"),
+        ("PINHOLE,640,480,a,500,320,240", "does not have the form"),
+    ],
+)
+def test_a_camera_that_is_not_understood_is_refused(text: str, problem: str) -> None:
+    with pytest.raises(ConfigError, match=problem):
+        Camera.parse(text)

@@ -8,7 +8,7 @@ from importlib import import_module
 
 import pytest
 
-MODULES = ["quaternions", "relative", "two_view"]
+MODULES = ["interpolation", "quaternions", "relative", "two_view"]
 
 
 def find_examples(module: str) -> list[doctest.DocTest]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,8 @@ from lightning_pose import models
 from lightning_pose.data import ClipDataModule, SceneDataModule
 from lightning_pose.data.batches import PoseBatch, PoseDataset, make_loader
 from lightning_pose.data.clip_dataset import ClipDataset, ClipShape
-from lightning_pose.features import SURF
+from lightning_pose.features import SURF, FeatureExtractor
+from lightning_pose.geometry.camera import Camera
 from lightning_pose.mapping.frames import MapFrames
 from lightning_pose.models import PoseModule
 from lightning_pose.scenes.scene import Frame, Scene
@@ -25,8 +27,10 @@ from tests.mapping.helpers import FOCAL_PX, make_frames, make_walk
 __all__ = [
     "ARCHITECTURES",
     "CLIP_LENGTH",
+    "WALL_CAMERA",
     "ClipProblem",
     "LearnableProblem",
+    "RefinableProblem",
     "SmallCNN",
     "WallProblem",
     "features_for",
@@ -41,6 +45,7 @@ _INPUT_SHAPES = {1: [32], 2: [20, 64], 3: [16, 3, 4]}
 CLIP_LENGTH = 4
 
 WALL_KEYPOINTS = 250
+WALL_CAMERA = "PINHOLE,640,480,500,500,319.5,239.5"
 
 _SEEDS = {"train": 0, "val": 11, "test": 12}  # of the frames of each split
 
@@ -58,7 +63,7 @@ def make_model(architecture: type[PoseModule], **settings: object) -> PoseModule
     if architecture is models.PoseNet:
         small = {"backbone": "tests.models.helpers.SmallCNN", "crop": 12, "input_shape": [3, 12, 12]}
     elif architecture is models.LandmarkMap:
-        small = {"input_shape": [WALL_KEYPOINTS, 36], "camera": "PINHOLE,640,480,500,500,319.5,239.5"}
+        small = {"input_shape": [WALL_KEYPOINTS, 36]}
     else:
         small = {"input_shape": _INPUT_SHAPES[architecture.input_ranks[0]]}
     model = architecture(**{**small, **settings})  # type: ignore[arg-type]
@@ -171,36 +176,81 @@ class ClipProblem(LearnableProblem, ClipDataModule):
 
 
 class WallProblem(LearnableProblem):
-    """Keypoints of a wall as cameras along it see them, in the form of a local extractor with its geometry."""
+    """Keypoints of a wall as cameras along it see them, in the form of a local extractor with its geometry.
 
-    def __init__(self, input_shape: list[int], count: int = 12) -> None:
+    Args:
+        input_shape: of a frame's features.
+        count: frames of each split.
+        cameras: of the frames, in turn, in COLMAP's notation, whose images show what each camera sees; None for one
+            of `WALL_CAMERA` that is not known.
+    """
+
+    def __init__(self, input_shape: list[int], count: int = 12, cameras: Sequence[str | None] = (WALL_CAMERA,)) -> None:
         super().__init__(input_shape, count)
         self.extractor = SURF(input_shape[0], with_geometry=True)
-        frames, self.splits = [], {}
+        self.cameras = list(cameras)
+        frames, self.splits, self._sizes = [], {}, []
         for number, (split, seed) in enumerate(_SEEDS.items()):
             rotation, position_m = make_walk(count, seed)
             wall = make_frames(rotation, position_m + np.array([0.0, 0.03, 0.02]) * number, seed=seed)
             quats = Rotation.from_matrix(wall.rotation).as_quat(scalar_first=True)
             position_m, quat_wxyz = (torch.from_numpy(pose).float() for pose in (wall.position, quats))
             frame = torch.arange(count) + number * count
-            features = torch.from_numpy(wall_features(wall, input_shape[0]))
+            given = [cameras[i % len(cameras)] for i in range(count)]
+            seen_by = [Camera.parse(camera or WALL_CAMERA) for camera in given]
+            features = torch.from_numpy(wall_features(wall, input_shape[0], seen_by))
             self.splits[split] = PoseDataset(PoseBatch(features, position_m, quat_wxyz, frame))
             image = Path("wall.png")
             frames += [Frame(image, c, q, split, i) for i, (c, q) in enumerate(zip(wall.position, quats, strict=True))]
+            self._sizes += [(camera.width, camera.height) for camera in seen_by]
+            self._cameras |= {int(i): c and Camera.parse(c) for i, c in zip(frame, given, strict=True)}
         self.data = self.splits["train"]
         self.learnt = self.data.data
         splits = {split: part.data.frame.numpy() for split, part in self.splits.items()}
         self._scene = Scene("wall", Path("wall"), "wall", tuple(frames), splits)
 
-    def find_image_size(self, split: str) -> tuple[int, int]:
-        return 640, 480
+    def measure_image(self, frame: int) -> tuple[int, int]:
+        return self._sizes[frame]
+
+    def read_features(self, frames: Sequence[int]) -> torch.Tensor:
+        data = [self.splits[split].data for split in _SEEDS]
+        return torch.cat([part.features for part in data])[list(frames)]
 
 
-def wall_features(wall: MapFrames, n: int) -> np.ndarray:
+class RefinableProblem(WallProblem):
+    """Frames of a wall whose features are (D,) numbers that show the pose roughly, beside the wall's keypoints."""
+
+    def __init__(self, columns: int = 16, count: int = 12) -> None:
+        super().__init__([WALL_KEYPOINTS, 36], count)
+        self.keypoints = self.splits
+        mix = torch.randn(7, columns, generator=torch.Generator().manual_seed(1))
+        self.splits = {}
+        for split, frames in self.keypoints.items():
+            noise = 0.1 * torch.randn(count, columns, generator=torch.Generator().manual_seed(_SEEDS[split]))
+            features = torch.cat([frames.data.position_m, frames.data.quat_wxyz], dim=-1) @ mix + noise
+            self.splits[split] = PoseDataset(frames.data._replace(features=features))
+        self.data = self.splits["train"]
+        self.learnt = self.data.data
+        self.extractor = Thumbnails()
+
+    def with_extractor(self, extractor: FeatureExtractor) -> SceneDataModule:
+        """The wall's keypoints, with descriptors as wide as the extractor's."""
+        other = WallProblem([WALL_KEYPOINTS, 36])
+        other._scene, other.splits = self.scene, {}
+        for split, frames in self.keypoints.items():
+            descriptors, places = frames.data.features.split([32, 4], dim=-1)
+            wider = torch.zeros(*descriptors.shape[:2], extractor.feature_shape[1] - 36)
+            features = torch.cat([descriptors, wider, places], dim=-1)
+            other.splits[split] = PoseDataset(frames.data._replace(features=features))
+        return other
+
+
+def wall_features(wall: MapFrames, n: int, cameras: Sequence[Camera]) -> np.ndarray:
     """(F, n, 36) float32: descriptors, x and y in -1 to 1, log2 of size by 16 pixels, response."""
-    pixels = wall.points * FOCAL_PX + [319.5, 239.5]
-    places = pixels / [320, 240] - 1
-    size = np.log2(np.maximum(wall.size_px, 1) / 16)[..., None]
+    places = np.stack([camera.project(rays) for camera, rays in zip(cameras, wall.points, strict=True)])
+    places = places / np.array([[camera.width, camera.height] for camera in cameras])[:, None] * 2 - 1
+    size_px = wall.size_px * (np.array([camera.focal_px for camera in cameras]) / FOCAL_PX)[:, None]
+    size = np.log2(np.maximum(size_px, 1) / 16)[..., None]
     rows = np.concatenate([wall.descriptors, places, size, np.zeros_like(size)], axis=2) * wall.real[..., None]
     padded = np.zeros((len(wall), n, rows.shape[2]), np.float32)
     padded[:, : rows.shape[1]] = rows[:, :n]

@@ -13,12 +13,11 @@ from lightning_pose.checkpoint import build_object
 from lightning_pose.errors import ConfigError, DataError
 from lightning_pose.evaluation.maps import evaluate_map
 from lightning_pose.features import SURF
+from lightning_pose.geometry.camera import Camera
 from lightning_pose.geometry.quaternions import position_error_m
 from lightning_pose.metrics import catalog
 from lightning_pose.models import LandmarkMap
-from tests.models.helpers import WALL_KEYPOINTS, WallProblem
-
-CAMERA = "PINHOLE,640,480,500,500,319.5,239.5"
+from tests.models.helpers import WALL_CAMERA, WALL_KEYPOINTS, WallProblem
 
 
 def fit_wall(problem: WallProblem | None = None, **settings: object) -> tuple[LandmarkMap, WallProblem]:
@@ -34,7 +33,7 @@ def fit_wall(problem: WallProblem | None = None, **settings: object) -> tuple[La
 
 @pytest.fixture(scope="module")
 def fitted() -> tuple[LandmarkMap, WallProblem]:
-    return fit_wall(camera=CAMERA)
+    return fit_wall()
 
 
 def test_test_frames_are_located_to_a_centimetre(fitted: tuple[LandmarkMap, WallProblem]) -> None:
@@ -44,7 +43,7 @@ def test_test_frames_are_located_to_a_centimetre(fitted: tuple[LandmarkMap, Wall
 
 
 def test_without_a_camera_the_focal_length_is_found_and_printed(capsys: pytest.CaptureFixture[str]) -> None:
-    model, problem = fit_wall()
+    model, problem = fit_wall(WallProblem([WALL_KEYPOINTS, 36], cameras=[None]))
     printed = capsys.readouterr().out
     assert "the camera is unknown: a focal length of" in printed
     assert "map of 24 frames" in printed
@@ -53,10 +52,41 @@ def test_without_a_camera_the_focal_length_is_found_and_printed(capsys: pytest.C
     assert position_error_m(model(data.features).position_m, data.position_m).median() < 0.03
 
 
-def test_a_camera_of_other_images_is_scaled() -> None:
-    model, _ = fit_wall(camera="PINHOLE,1280,960,1000,1000,639.5,479.5")
-    view = model.network.view
-    np.testing.assert_allclose([view.width, view.fx, view.cx, view.cy], [640, 500, 319.5, 239.5])
+def test_each_frame_has_its_own_camera(capsys: pytest.CaptureFixture[str]) -> None:
+    """Two cameras with distortion, of images that differ in size; one of them is a fisheye."""
+    cameras = [
+        "OPENCV,1280,960,1000,1010,650,470,-0.2,0.05,0.001,-0.002",
+        "OPENCV_FISHEYE,320,240,220,225,150,125,0.05,0,0,0",
+    ]
+    model, problem = fit_wall(WallProblem([WALL_KEYPOINTS, 36], count=20, cameras=cameras))
+    assert "2 cameras; images that come without one are located as if by" in capsys.readouterr().out
+    data = problem.dataset("test").data
+    error = position_error_m(model.predict_step(data, 0).position_m, data.position_m)
+    assert error[::2].median() < 0.01
+    assert error[1::2].median() < 0.01
+    without = position_error_m(model(data.features).position_m, data.position_m)
+    assert without[1::2].median() > 0.02
+
+
+def test_images_of_another_size_are_located_as_well(fitted: tuple[LandmarkMap, WallProblem]) -> None:
+    model, _ = fitted
+    errors = []
+    for width, height in ((640, 480), (320, 240), (1280, 960)):
+        seen_by = str(Camera.parse(WALL_CAMERA).resize(width, height))
+        data = WallProblem([WALL_KEYPOINTS, 36], count=30, cameras=[seen_by]).dataset("test").data
+        pose = model.locate_images(data.features, [(width, height)] * 30)
+        errors.append(position_error_m(torch.from_numpy(pose.position_m), data.position_m).median())
+    assert max(errors) < 1.05 * errors[0]
+
+
+def test_images_of_another_camera_need_it(fitted: tuple[LandmarkMap, WallProblem]) -> None:
+    model, _ = fitted
+    other = "SIMPLE_RADIAL,640,640,380,300,330,-0.1"
+    data = WallProblem([WALL_KEYPOINTS, 36], count=30, cameras=[other]).dataset("test").data
+    pose = model.locate_images(data.features, [(640, 640)] * 30, Camera.parse(other))
+    assert position_error_m(torch.from_numpy(pose.position_m), data.position_m).median() < 0.01
+    with pytest.raises(ConfigError, match=r"640x640 pixels, and its camera is for 640x480.*give camera for its own"):
+        model.locate_images(data.features, [(640, 640)] * 30)
 
 
 def test_a_checkpoint_holds_the_map(fitted: tuple[LandmarkMap, WallProblem]) -> None:
@@ -83,7 +113,11 @@ def test_answers_are_accepted_with_a_radius_or_refused_with_a_reason(fitted: tup
 
 def test_a_test_says_what_the_map_accepts_and_how_well_it_knows(fitted: tuple[LandmarkMap, WallProblem]) -> None:
     model, problem = fitted
-    found = evaluate_map(model, problem.scene, problem.dataset("test").data)
+    data = problem.dataset("test").data
+    answers = model.network.locate(data.features)
+    found = evaluate_map(
+        model.network, answers, model.world_frame, model(data.features), problem.scene, data, "LandmarkMap"
+    )
     assert found.metrics.keys() == {f"test/{name}" for name in catalog.MAP}
     assert found.metrics["test/accepted"] == 1.0
     assert found.metrics["test/coverage_position"] > 0.6
@@ -103,21 +137,7 @@ def test_frames_of_which_nothing_can_be_triangulated_are_refused() -> None:
     frames = problem.scene.frames
     problem._scene = replace(problem.scene, frames=tuple(replace(f, position_m=np.zeros(3)) for f in frames))
     with pytest.raises(DataError, match=r"no point of wall could be triangulated from 12 frames.*check"):
-        fit_wall(problem, camera=CAMERA)
-
-
-@pytest.mark.parametrize(
-    ("text", "problem"),
-    [
-        ("PINHOLE,640,480,500,500,320", "does not have the form PINHOLE,WIDTH,HEIGHT,FX,FY,CX,CY"),
-        ("LENS,640,480,500", "'LENS' is no camera model; give one of SIMPLE_PINHOLE"),
-        ("PINHOLE,640,480,0,500,320,240", "focal lengths must be above 0"),
-        ("PINHOLE,640,480,a,500,320,240", "does not have the form"),
-    ],
-)
-def test_a_camera_that_is_not_understood_is_refused(text: str, problem: str) -> None:
-    with pytest.raises(ConfigError, match=problem):
-        LandmarkMap(input_shape=[50, 68], camera=text)
+        fit_wall(problem)
 
 
 def test_bundle_adjustment_that_is_not_understood_is_refused() -> None:

@@ -10,6 +10,8 @@ import torch
 from lightning import Trainer
 from mlflow.entities import Run
 
+from lightning_pose.checkpoint import read_checkpoint
+from lightning_pose.runs.resume import check_same_settings
 from tests.helpers import FailAt, Workplace
 
 LIVELY = ["--trainer.max_epochs", "5", "--model.dropout", "0.3", "--model.layers", "2"]
@@ -125,6 +127,16 @@ def test_settings_that_change_no_result_may_differ(workplace: Workplace) -> None
     assert workplace.run("fit", "--ckpt_path", "last", "--data.eval_batch_size", "3") == 0
     (run,) = workplace.runs()
     assert run.info.status == "FINISHED"
+
+
+def test_the_folders_of_the_data_may_have_moved(workplace: Workplace) -> None:
+    assert workplace.run("fit") == 0
+    (run,) = workplace.runs()
+    checkpoint = str(workplace.checkpoint(run, "last"))
+    specs = read_checkpoint(checkpoint)["lightning_pose"]
+    places = {"root": "new", "train_scenes": None, "test_scenes": None, "val_scenes": ["new"], "pgt": "new"}
+    moved = {**specs["data"], "init_args": {**specs["data"]["init_args"], **places}}
+    check_same_settings(checkpoint, specs["model"], moved, 0, "32-true")
 
 
 def test_more_epochs_are_recorded(workplace: Workplace) -> None:

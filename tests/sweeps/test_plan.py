@@ -42,7 +42,15 @@ def test_losses_that_differ_are_no_objective(sweep: Write) -> None:
         read_plan(sweep(base=both, objective="val/loss"), {})
 
 
-@pytest.mark.parametrize(("space", "comparable"), [({"model.units": [4]}, True), ({"data.root": ["a", "b"]}, False)])
+@pytest.mark.parametrize(
+    ("space", "comparable"),
+    [
+        ({"model.units": [4]}, True),
+        ({"data.root": ["a", "b"]}, False),
+        ({"data.val_scenes": [["a"], ["b"]]}, False),
+        ({"data.ground_truth": ["original", "registered"]}, False),
+    ],
+)
 def test_scenes_are_not_equally_hard(space: dict[str, Any], comparable: bool, sweep: Write) -> None:
     assert read_plan(sweep(space=space), {}).comparable == comparable
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import fields
 
 import numpy as np
@@ -38,12 +39,14 @@ MAP_SHAPES = {
 CAMERA_NUMBERS = 15
 
 
-def keypoints_to_frames(features: Tensor, camera: Camera, rotation: np.ndarray, position: np.ndarray) -> MapFrames:
+def keypoints_to_frames(
+    features: Tensor, cameras: Sequence[Camera], rotation: np.ndarray, position: np.ndarray
+) -> MapFrames:
     """Frames for a map from what a local extractor with `with_geometry` returns.
 
     Args:
         features: (F, N, D + 4), rows of zeros past the real keypoints.
-        camera: of all frames.
+        cameras: F, each for its image as it is; sizes of keypoints and thresholds are in the pixels of that image.
         rotation: (F, 3, 3), camera-to-world.
         position: (F, 3).
     """
@@ -51,16 +54,18 @@ def keypoints_to_frames(features: Tensor, camera: Camera, rotation: np.ndarray, 
     descriptors = np.ascontiguousarray(array[..., :-GEOMETRY], dtype=np.float32)
     real: np.ndarray = (descriptors != 0).any(axis=2)
     x, y, log_size = np.moveaxis(array[..., -GEOMETRY:-1].astype(np.float64), -1, 0)
-    pixels = np.stack([(x + 1) * camera.width / 2, (y + 1) * camera.height / 2], axis=-1)
-    points = np.where(real[..., None], camera.normalize(pixels), 0.0)
-    count = len(array)
+    points = np.zeros((*x.shape, 2))
+    for camera in dict.fromkeys(cameras):
+        rows = [row for row, other in enumerate(cameras) if other == camera]
+        pixels = np.stack([(x[rows] + 1) * camera.width / 2, (y[rows] + 1) * camera.height / 2], axis=-1)
+        points[rows] = np.where(real[rows][..., None], camera.normalize(pixels), 0.0)
     return MapFrames(
         points=points,
         size_px=np.where(real, 16 * 2**log_size, 0).astype(np.float32),
         descriptors=descriptors,
         count=real.sum(axis=1),
-        focal_px=np.full(count, camera.focal_px),
-        half_view=np.tile(camera.half_view, (count, 1)),
+        focal_px=np.array([camera.focal_px for camera in cameras]),
+        half_view=np.array([camera.half_view for camera in cameras]).reshape(-1, 2),
         rotation=rotation,
         position=position,
     )
@@ -91,7 +96,7 @@ class MapNetwork(nn.Module):
         self._localizer = None
 
     def set_map(self, point_map: PointMap, camera: Camera, calibration: Calibration) -> None:
-        """Take a map, the camera that its queries have, and the factors of its radii."""
+        """Take a map, the camera of queries that come without one, and the factors of its radii."""
         device = self.calibration.device
         for field in fields(point_map):
             kind = MAP_SHAPES[field.name][1]
@@ -110,13 +115,17 @@ class MapNetwork(nn.Module):
 
     @property
     def view(self) -> Camera:
-        """The camera of the queries."""
+        """The camera of queries that come without one."""
         width, height, fx, fy, cx, cy, fisheye, *distortion = self.camera_numbers.tolist()
         coefficients = tuple(distortion[:4] if fisheye else distortion) if any(distortion) else ()
         return Camera(int(width), int(height), fx, fy, cx, cy, coefficients, bool(fisheye))
 
-    def locate(self, features: Tensor) -> list[MapAnswer]:
+    def locate(self, features: Tensor, cameras: Sequence[Camera] | None = None) -> list[MapAnswer]:
         """Answers for (B, N, D + 4) features.
+
+        Args:
+            features: of B images.
+            cameras: B, each for its image as it is; `view` for all if None.
 
         Raises:
             RuntimeError: there is no map yet.
@@ -126,7 +135,8 @@ class MapNetwork(nn.Module):
         if self._localizer is None:
             self._localizer = MapLocalizer(self.point_map)
         nowhere = np.zeros((len(features), 3))
-        frames = keypoints_to_frames(features, self.view, np.zeros((len(features), 3, 3)), nowhere)
+        cameras = [self.view] * len(features) if cameras is None else cameras
+        frames = keypoints_to_frames(features, cameras, np.zeros((len(features), 3, 3)), nowhere)
         return [self._localizer.locate(frames.query(i)) for i in range(len(frames))]
 
     def find_radii(self, answers: list[MapAnswer]) -> tuple[np.ndarray, np.ndarray]:
@@ -140,13 +150,16 @@ class MapNetwork(nn.Module):
         refused = ~np.array([answer.accepted for answer in answers], bool)
         return np.where(refused, np.inf, position), np.where(refused, np.inf, orientation)
 
-    def forward(self, features: Tensor) -> Tensor:
-        """(B, N, D + 4) -> (B, 7), position and quaternion; the identity where there is no map yet."""
+    def forward(self, features: Tensor, cameras: Sequence[Camera] | None = None) -> Tensor:
+        """(B, N, D + 4) -> (B, 7), position and quaternion; the identity where there is no map yet.
+
+        `cameras` as for `locate`.
+        """
         if not len(self.position):
             pose = [[0.0, 0, 0, 1, 0, 0, 0]] * len(features)
         else:
             pose = [
                 [*answer.pose.position, *Rotation.from_matrix(answer.pose.rotation).as_quat(scalar_first=True)]
-                for answer in self.locate(features)
+                for answer in self.locate(features, cameras)
             ]
         return torch.tensor(np.array(pose).reshape(-1, 7), dtype=features.dtype, device=features.device)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from typing import Any, ClassVar
 
 from lightning import LightningModule
 from torch import Tensor, nn
 
-__all__ = ["TrainingMemory"]
+__all__ = ["TrainingMemory", "resize_tensors"]
 
 
 class TrainingMemory(LightningModule):
@@ -29,15 +30,20 @@ class TrainingMemory(LightningModule):
 
     def resize_memory(self, state_dict: dict[str, Tensor]) -> None:
         """Give each tensor of the memory the length that it has in a state dict; its values become zeros."""
-        parameters = dict(self.named_parameters())
-        for name in self.memory:
-            if name in state_dict:
-                tensor = parameters[name] if name in parameters else self.get_buffer(name)
-                tensor.data = tensor.new_zeros(len(state_dict[name]), *tensor.shape[1:])
+        resize_tensors(self, self.memory, state_dict)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         self.resize_memory(checkpoint["state_dict"])
         super().on_load_checkpoint(checkpoint)
+
+
+def resize_tensors(module: nn.Module, names: Iterable[str], state_dict: Mapping[str, Tensor]) -> None:
+    """Give a module's parameters and buffers the lengths that they have in a state dict; their values become zeros."""
+    parameters = dict(module.named_parameters())
+    for name in names:
+        if name in state_dict:
+            tensor = parameters[name] if name in parameters else module.get_buffer(name)
+            tensor.data = tensor.new_zeros(len(state_dict[name]), *tensor.shape[1:])
 
 
 def _resize_before_load(module: nn.Module, state_dict: dict[str, Tensor], prefix: str, *_: object) -> None:

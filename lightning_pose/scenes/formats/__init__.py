@@ -11,6 +11,7 @@ from typing import Literal, get_args
 
 from lightning_pose.errors import ConfigError, DataError
 from lightning_pose.scenes.formats.base import SceneFormat, describe_bad_frames
+from lightning_pose.scenes.formats.split_rules import apply_split_rule
 from lightning_pose.scenes.scene import Scene
 from lightning_pose.scenes.splits import make_splits
 
@@ -36,6 +37,7 @@ def load_scene(
     test_fraction: float = 0.2,
     val_block: int = 1,
     on_bad_frame: OnBadFrame | Literal["list"] = "refuse",
+    split: str | None = None,
 ) -> Scene:
     """Read a folder of posed images.
 
@@ -48,12 +50,15 @@ def load_scene(
         on_bad_frame: what to do if frames cannot be used, because their pose is missing, has NaN, infinite or no
             numbers or is no rotation, or because their image is missing: `refuse` the scene, `drop` the frames with a
             warning, or `list` them in `bad_frames` without a warning.
+        split: a rule that says which frames to test on, see `apply_split_rule`; None for the format's own split, and
+            for `blocks` where it has none.
 
     Returns:
         the scene with splits `train`, `val` and `test`; no image is decoded.
 
     Raises:
-        ConfigError: no format has that name, `on_bad_frame` is unknown, or a fraction is out of range.
+        ConfigError: no format has that name, `on_bad_frame` is unknown, `split` is no rule, or a fraction is out of
+            range.
         DataError: the folder is missing or of no known format, one of its files is missing or malformed, or frames
             cannot be used.
     """
@@ -65,6 +70,8 @@ def load_scene(
     scene = _choose_scene_format(root, format).read(root)
     _check_bad_frames(scene, on_bad_frame)
     source = "official" if scene.splits else "blocks"
+    if split is not None:
+        scene, source = replace(scene, splits=apply_split_rule(scene, split)), split
     return replace(scene, splits=make_splits(scene, val_fraction, test_fraction, val_block), split_source=source)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from lightning_pose.errors import DataError
 from lightning_pose.scenes.formats.image_files import IMAGE_SUFFIXES, choose_images
 from lightning_pose.scenes.formats.poses import check_matrices
-from lightning_pose.scenes.formats.text_files import list_files, parse_numbers, read_text
+from lightning_pose.scenes.formats.text_files import list_files, read_matrix
 
 __all__ = ["FrameFolder", "has_posed_frames", "read_frame_folder"]
 
@@ -78,7 +78,7 @@ def read_frame_folder(folder: Path) -> FrameFolder:
             fault = f"{poses[number]} has no image beside it; add it or drop the pose"
         else:
             try:
-                matrices[row] = _read_matrix(poses[number])
+                matrices[row] = read_matrix(poses[number])
             except (ValueError, DataError) as error:
                 fault = f"{poses[number]}: not a 4x4 matrix of numbers ({error}); restore the original"
         faults.append(fault)
@@ -90,21 +90,6 @@ def read_frame_folder(folder: Path) -> FrameFolder:
     ]
     paths = [image_of.get(number, folder / f"frame-{number:06d}") for number in index]
     return FrameFolder(index, paths, position_m, quat_wxyz, faults, lost)
-
-
-def _read_matrix(path: Path) -> np.ndarray:
-    """Read a pose file, (4, 4) float64; the last row may be left out.
-
-    Raises:
-        DataError: the file is missing or is not text.
-        ValueError: it has another number of entries, or one that is not a number.
-    """
-    numbers = parse_numbers(read_text(path))
-    if len(numbers) == 12:
-        numbers = np.append(numbers, [0, 0, 0, 1])
-    if len(numbers) != 16:
-        raise ValueError(f"it has {len(numbers)} numbers")
-    return numbers.reshape(4, 4)
 
 
 def _warn_of_holes(folder: Path, index: list[int]) -> None:

@@ -11,7 +11,17 @@ import numpy as np
 
 from lightning_pose.errors import DataError
 
-__all__ = ["NumberTable", "find_column_order", "find_file", "list_files", "parse_numbers", "read_lines", "read_table"]
+__all__ = [
+    "NumberTable",
+    "find_column_order",
+    "find_file",
+    "list_files",
+    "parse_numbers",
+    "read_lines",
+    "read_matrix",
+    "read_table",
+    "read_text",
+]
 
 POSITION_PREFIXES = ("", "t", "p", "c", "pos", "position", "trans", "translation", "prsr", "ptx")
 """What stands before x, y or z in the name of a position's column, letters only."""
@@ -111,6 +121,21 @@ def parse_numbers(text: str, count: int | None = None) -> np.ndarray:
     if count is not None and len(numbers) != count:
         raise ValueError(f"expected {count} numbers, found {len(numbers)}")
     return numbers
+
+
+def read_matrix(path: Path) -> np.ndarray:
+    """Read a file of one pose, (4, 4) float64; the last row may be left out.
+
+    Raises:
+        DataError: the file is missing or is not text.
+        ValueError: it has another number of entries, or one that is not a number.
+    """
+    numbers = parse_numbers(read_text(path))
+    if len(numbers) == 12:
+        numbers = np.append(numbers, [0, 0, 0, 1])
+    if len(numbers) != 16:
+        raise ValueError(f"it has {len(numbers)} numbers")
+    return numbers.reshape(4, 4)
 
 
 def read_table(path: Path, columns: str) -> NumberTable:

@@ -39,8 +39,8 @@ def test_a_format_is_one_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_unknown_format_lists_the_known(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"'kitti' is unknown; the formats are 12scenes, 7scenes, cambridge, "):
-        load_scene(tmp_path, format="kitti")
+    with pytest.raises(ConfigError, match=r"'nuscenes' is unknown; the formats are 12scenes, 7scenes, ace, "):
+        load_scene(tmp_path, format="nuscenes")
 
 
 def test_missing_folder(tmp_path: Path) -> None:

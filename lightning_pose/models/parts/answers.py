@@ -1,0 +1,96 @@
+"""Answers: where images were taken, which part of a system says so, and how sure it is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from lightning_pose.mapping.map_localizer import MapAnswer
+from lightning_pose.models.parts.map_network import MapNetwork
+from lightning_pose.models.parts.poses import Pose
+from lightning_pose.models.parts.world_frame import WorldFrame
+
+__all__ = ["Answers", "answer_by_map", "answer_by_network", "convert_answers", "replace_accepted"]
+
+Source = Literal["network", "map", "nearest"]
+
+
+@dataclass(frozen=True)
+class Answers:
+    """Camera-to-world poses of M images.
+
+    Attributes:
+        position_m: (M, 3), in the scene's unit.
+        quat_wxyz: (M, 4), unit.
+        source: what each pose comes from: the `network`, the landmark `map`, or where a map alone refuses the image,
+            the `nearest` training frame.
+        reason: why the map refuses; empty where it accepts, and where there is none.
+        radius_m: (M,), around each position, holds 90 % of errors; nan where it is unknown, inf where refused.
+        radius_deg: (M,), the same of orientations.
+    """
+
+    position_m: np.ndarray
+    quat_wxyz: np.ndarray
+    source: tuple[Source, ...]
+    reason: tuple[str, ...]
+    radius_m: np.ndarray
+    radius_deg: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+
+def answer_by_network(pose: Pose) -> Answers:
+    """(M,) poses of a network, with unknown radii."""
+    count = len(pose.position_m)
+    unknown = np.full(count, np.nan)
+    position_m, quat_wxyz = (part.detach().cpu().numpy() for part in pose)
+    return Answers(position_m, quat_wxyz, ("network",) * count, ("",) * count, unknown, unknown)
+
+
+def answer_by_map(
+    pose: Pose, found: Sequence[MapAnswer], network: MapNetwork, scale: float, refused: Answers | None = None
+) -> Answers:
+    """(M,) poses, of a map where it accepts.
+
+    Args:
+        pose: in the world.
+        found: what the map says of the images.
+        network: the map.
+        scale: of its positions in the scene's unit.
+        refused: what holds where the map refuses; by default the nearest training frame, with no radius.
+    """
+    accepted = np.array([answer.accepted for answer in found], bool)
+    radius, radius_deg = network.find_radii(list(found))
+    radius_m = radius * scale
+    other: tuple[Source, ...] = ("nearest",) * len(found)
+    if refused is not None:
+        other = refused.source
+        radius_m, radius_deg = (
+            np.where(accepted, of_map, of_other)
+            for of_map, of_other in ((radius_m, refused.radius_m), (radius_deg, refused.radius_deg))
+        )
+    source: tuple[Source, ...] = tuple("map" if ok else instead for ok, instead in zip(accepted, other, strict=True))
+    reason = tuple(answer.reason for answer in found)
+    position_m, quat_wxyz = (part.detach().cpu().numpy() for part in pose)
+    return Answers(position_m, quat_wxyz, source, reason, radius_m, radius_deg)
+
+
+def replace_accepted(pose: Pose, answers: Sequence[MapAnswer], world_frame: WorldFrame) -> Pose:
+    """(B,) poses in the world: the map's where it accepts, those given elsewhere."""
+    found = convert_answers(answers, world_frame)
+    accepted = torch.tensor([[answer.accepted] for answer in answers]).to(pose.position_m.device)
+    return Pose(*(torch.where(accepted, new.to(old), old) for new, old in zip(found, pose, strict=True)))
+
+
+def convert_answers(answers: Sequence[MapAnswer], world_frame: WorldFrame) -> Pose:
+    """(B,) poses in the world, float64, of a map's answers, refused ones too."""
+    position = np.array([answer.pose.position for answer in answers]).reshape(-1, 3)
+    rotation = np.array([answer.pose.rotation for answer in answers]).reshape(-1, 3, 3)
+    quats = torch.from_numpy(Rotation.from_matrix(rotation).as_quat(scalar_first=True))
+    return Pose(world_frame.to_world(torch.from_numpy(position)), quats)

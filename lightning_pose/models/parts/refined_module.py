@@ -1,0 +1,150 @@
+"""RefinedModule: regressors with a landmark map beside them, from its building to the poses that it replaces."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from lightning_pose.data.datamodule import SceneDataModule, scene_datamodule
+from lightning_pose.errors import CheckpointError, ConfigError, DataError
+from lightning_pose.geometry.camera import Camera
+from lightning_pose.models.parts.answers import Answers, answer_by_map, answer_by_network, replace_accepted
+from lightning_pose.models.parts.checkpoint_hooks import CheckpointHooks
+from lightning_pose.models.parts.frame_cameras import scale_cameras
+from lightning_pose.models.parts.poses import Pose
+from lightning_pose.models.parts.refinement import MapRefinement, MapSettings
+from lightning_pose.models.parts.world_frame import WorldFrame
+
+__all__ = ["RefinedModule"]
+
+PREFIX = "refinement."
+
+_log = logging.getLogger("lightning_pose")
+
+
+class RefinedModule(CheckpointHooks):
+    """Mixin of `PoseModule`: with `refine`, a frame has the pose of a landmark map where the map accepts it.
+
+    The regressor is trained as without. The map is built of the frames that the regressor learns from, before its
+    first step; if it learns from validation frames in the end, the map is then built again with them. Losses are of
+    the regressor alone, errors are of the refined poses. Frames of which no map can be built leave the regressor alone.
+
+    Attributes:
+        refinement: the map; None without `refine`.
+        refusal: why this architecture takes no map; empty where it does.
+    """
+
+    refusal: ClassVar[str] = ""
+    refinement: MapRefinement | None
+    world_frame: WorldFrame
+
+    def register_refinement(self, refine: bool | MapSettings | Mapping[str, Any]) -> None:
+        """Add the map that is asked for, empty.
+
+        Raises:
+            ConfigError: the architecture takes none.
+        """
+        settings = MapSettings.parse(refine)
+        if settings is not None and self.refusal:
+            raise ConfigError(f"model.refine is on, but {type(self).__name__} {self.refusal}; leave it out")
+        self.hparams["refine"] = False if settings is None else asdict(settings)
+        self.refinement = None if settings is None else MapRefinement(settings)
+
+    @property
+    def system_name(self) -> str:
+        """The architecture's name, and whether its poses are refined."""
+        return f"{type(self).__name__} refined" if self.refinement is not None else type(self).__name__
+
+    def attach_refinement(self, datamodule: SceneDataModule | None) -> None:
+        """Let the map take keypoints of the trainer's frames.
+
+        Raises:
+            ConfigError: the trainer has no data module.
+        """
+        if self.refinement is not None:
+            self.refinement.attach(datamodule or scene_datamodule(self.trainer), self.world_frame, self.print)
+
+    def on_train_start(self) -> None:
+        """Build the map that validation frames are located in, unless the run goes on with one."""
+        if self.refinement is not None and not (self.refinement.has_map and self.trainer.current_epoch):
+            self._fit_refinement(self.refinement, ("train",), calibrate=not self._learns_val)
+
+    def refit_refinement(self) -> None:
+        """Build the map again if the regressor has learnt from more frames by now."""
+        if self.refinement is not None and self._learns_val:
+            self._fit_refinement(self.refinement, self.training_splits, calibrate=True)
+
+    @torch.no_grad()
+    def _fit_refinement(self, refinement: MapRefinement, splits: tuple[str, ...], calibrate: bool) -> None:
+        try:
+            refinement.fit(splits, calibrate)
+        except DataError as error:  # no texture, or poses that do not fit the images
+            _log.warning("no map refines this %s: %s", type(self).__name__, error)
+
+    @property
+    def _learns_val(self) -> bool:
+        """Whether there are validation frames that the regressor learns from in the end."""
+        return "val" in self.training_splits and len(scene_datamodule(self.trainer).scene.splits["val"]) > 0
+
+    def refine_pose(self, frame: Tensor, pose: Pose) -> Pose:
+        """Poses of the trainer's frames, the map's where it accepts.
+
+        Args:
+            frame: (B,) indices into `Scene.frames`.
+            pose: of the regressor.
+        """
+        if self.refinement is None or not self.refinement.has_map:
+            return pose
+        return replace_accepted(pose, self.refinement.locate_frames(frame.tolist()), self.world_frame)
+
+    def locate_images(
+        self,
+        features: Tensor,
+        sizes: Sequence[tuple[int, int]],
+        camera: Camera | None = None,
+        keypoints: Tensor | None = None,
+    ) -> Answers:
+        """Answers for images from anywhere, as a `Localizer` has them.
+
+        Args:
+            features: (B, *input_shape).
+            sizes: width and height of each image, in pixels; only maps use them.
+            camera: of all images, scaled to each; that of the training images if None.
+            keypoints: (B, N, D + 4) of the same images, by the extractor of `refinement`, where there is one.
+
+        Raises:
+            ConfigError: a camera is given, and there is no map that reads it; or it is for images of another shape.
+        """
+        if self.refinement is None and camera is not None:
+            raise ConfigError(f"{type(self).__name__} does not use cameras; leave camera out")
+        pose: Pose = self(features)
+        alone = answer_by_network(pose)
+        if self.refinement is None or not self.refinement.has_map or keypoints is None:
+            return alone
+        network = self.refinement.network
+        found = network.locate(keypoints, scale_cameras(network.view if camera is None else camera, sizes))
+        refined = replace_accepted(pose, found, self.world_frame)
+        return answer_by_map(refined, found, network, self.world_frame.scale, alone)
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Give the map the checkpoint's size; without `refine`, leave the checkpoint's map out.
+
+        Raises:
+            CheckpointError: as `CheckpointHooks`, or `refine` asks for a map, and the checkpoint has none.
+        """
+        state = checkpoint["state_dict"]
+        own = {name.removeprefix(PREFIX): value for name, value in state.items() if name.startswith(PREFIX)}
+        if self.refinement is None:
+            checkpoint["state_dict"] = {name: value for name, value in state.items() if not name.startswith(PREFIX)}
+        elif own:
+            self.refinement.resize_map(own)
+        else:
+            raise CheckpointError(
+                "model.refine is on, but the checkpoint has no map; leave it out, or train with --model.refine true"
+            )
+        super().on_load_checkpoint(checkpoint)
