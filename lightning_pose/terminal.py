@@ -1,7 +1,8 @@
-"""Tables for the terminal; a table that is too wide for it is printed with rows and columns exchanged."""
+"""Tables of text: for the terminal, with rows and columns exchanged where only that fits, and in Markdown."""
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,7 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-__all__ = ["Sheet"]
+__all__ = ["Sheet", "escape_markdown", "format_markdown"]
 
 UNKNOWN_WIDTH = 120  # characters; for output into a file or another process
 
@@ -60,6 +61,25 @@ class Sheet:
         for row in rows:
             table.add_row(*map(escape, row))  # a reason may have brackets
         return table
+
+
+def escape_markdown(text: str) -> str:
+    """The text as Markdown shows it, with a backslash before each character that Markdown reads as its own."""
+    return re.sub(r"([|*<\\])", r"\\\1", text)
+
+
+def format_markdown(heads: Sequence[str], rows: Sequence[Sequence[str]], texts: int | None = None) -> str:
+    """A table in Markdown, a line each for the heads, the alignment and every row.
+
+    Args:
+        heads: heads of the columns.
+        rows: rows of cells, one cell for each head.
+        texts: how many columns hold text; the others are aligned right. All by default.
+    """
+    count = len(heads) if texts is None else texts
+    aligned = ["---" if i < count else "---:" for i in range(len(heads))]
+    escaped = [[escape_markdown(cell) for cell in row] for row in (heads, *rows)]
+    return "\n".join(f"| {' | '.join(row)} |" for row in (escaped[0], aligned, *escaped[1:]))
 
 
 def _find_least_width(columns: Sequence[Sequence[str]]) -> int:

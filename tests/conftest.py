@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,6 +14,9 @@ if TYPE_CHECKING:  # they take seconds to import, and most tests do without
     from tests.helpers import Trained, Workplace
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported: each test process has one core
+# Tests start processes: without compiled modules on disk each would compile all that it imports, for seconds.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 
 def pytest_configure() -> None:

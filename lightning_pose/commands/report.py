@@ -63,14 +63,17 @@ def main(argv: list[str]) -> int:
     args = _build_report_parser().parse_args(argv)
     # Only now, so that `--help` is there at once.
     from lightning_pose.reports.baseline_rows import add_baselines
-    from lightning_pose.reports.filters import Filters, select_runs
+    from lightning_pose.reports.filters import select_runs
     from lightning_pose.reports.published_rows import add_published
     from lightning_pose.reports.table import build_report
     from lightning_pose.runs.reader import read_runs
 
     if args.chapter and not args.published:
         raise ConfigError("--chapter chooses among published rows; give --published as well")
-    filters = Filters(
+    form = args.format or _choose_format(args.out)
+    uri = args.tracking_uri or default_tracking_uri()
+    runs, notes = select_runs(
+        read_runs(uri),
         experiments=[args.experiment] if args.experiment else [],
         systems=args.system,
         scenes=args.scene,
@@ -79,9 +82,6 @@ def main(argv: list[str]) -> int:
         until=args.until,
         trials=args.trials,
     )
-    form = args.format or _choose_format(args.out)
-    uri = args.tracking_uri or default_tracking_uri()
-    runs, notes = select_runs(read_runs(uri), filters)
     report = build_report(runs, args.pick, tuple(dict.fromkeys(args.by)))
     report.notes += notes
     if args.baselines:

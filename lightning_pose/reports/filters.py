@@ -4,23 +4,32 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from datetime import datetime, timedelta
 
 from lightning_pose.errors import ConfigError
 from lightning_pose.metrics.catalog import MEDIANS
 from lightning_pose.runs.reader import Run
 
-__all__ = ["Filters", "check_setting", "read_date", "select_runs"]
+__all__ = ["check_setting", "read_date", "select_runs"]
 
 MOST = 12  # values that a message lists
 
 
-@dataclass(frozen=True)
-class Filters:
-    """What the runs must be; by default every run that no sweep made.
+def select_runs(
+    runs: Sequence[Run],
+    *,
+    experiments: Sequence[str] = (),
+    systems: Sequence[str] = (),
+    scenes: Sequence[str] = (),
+    tags: Sequence[tuple[str, str]] = (),
+    since: str | None = None,
+    until: str | None = None,
+    trials: bool = False,
+) -> tuple[list[Run], list[str]]:
+    """The runs that pass all filters and have been tested, in their order; by default every run that no sweep made.
 
-    Attributes:
+    Args:
+        runs: to choose from.
         experiments: names of MLflow experiments.
         systems: architectures.
         scenes: names of scenes.
@@ -28,19 +37,6 @@ class Filters:
         since: when they started, at the earliest: an ISO date or time.
         until: when they started, before this time or the end of this day.
         trials: runs of sweeps as well.
-    """
-
-    experiments: Sequence[str] = ()
-    systems: Sequence[str] = ()
-    scenes: Sequence[str] = ()
-    tags: Sequence[tuple[str, str]] = ()
-    since: str | None = None
-    until: str | None = None
-    trials: bool = False
-
-
-def select_runs(runs: Sequence[Run], filters: Filters) -> tuple[list[Run], list[str]]:
-    """The runs that pass all filters and have been tested, in their order.
 
     Returns:
         The runs, and notes on what was left out.
@@ -48,22 +44,22 @@ def select_runs(runs: Sequence[Run], filters: Filters) -> tuple[list[Run], list[
     Raises:
         ConfigError: nothing passes; the message names the filter and the values that exist.
     """
-    kept = [run for run in runs if filters.trials or not run.trial]
+    kept = [run for run in runs if trials or not run.trial]
     if not kept:
         raise ConfigError(f"all {len(runs)} finished runs are trials of sweeps; give --trials, or train with `fit`")
-    kept = _keep_values(kept, "--experiment ", filters.experiments, lambda run: run.experiment)
-    kept = _keep_values(kept, "--system ", filters.systems, lambda run: run.system)
-    kept = _keep_values(kept, "--scene ", filters.scenes, lambda run: run.scene)
-    for name in dict.fromkeys(name for name, _ in filters.tags):
+    kept = _keep_values(kept, "--experiment ", experiments, lambda run: run.experiment)
+    kept = _keep_values(kept, "--system ", systems, lambda run: run.system)
+    kept = _keep_values(kept, "--scene ", scenes, lambda run: run.scene)
+    for name in dict.fromkeys(name for name, _ in tags):
         check_setting(name, kept)
-        wanted = [value for other, value in filters.tags if other == name]
+        wanted = [value for other, value in tags if other == name]
         kept = _keep_values(kept, f"--tag {name}=", wanted, lambda run, name=name: run.settings.get(name))
-    kept = _keep_dates(kept, filters.since, filters.until)
+    kept = _keep_dates(kept, since, until)
     tested = [run for run in kept if f"test/{MEDIANS[0]}" in run.metrics]
     if not tested:
-        trials = " (trials of a sweep never see test frames)" if any(run.trial for run in kept) else ""
+        why = " (trials of a sweep never see test frames)" if any(run.trial for run in kept) else ""
         raise ConfigError(
-            f"none of the {len(kept)} runs has test errors{trials}; "
+            f"none of the {len(kept)} runs has test errors{why}; "
             "measure a checkpoint with `python -m lightning_pose test --ckpt_path CKPT`"
         )
     missing = len(kept) - len(tested)

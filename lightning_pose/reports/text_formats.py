@@ -9,6 +9,7 @@ from typing import TextIO
 
 from lightning_pose.metrics.catalog import COSTS, ERRORS, MEDIANS, SKILLS
 from lightning_pose.reports.table import Cell, Report
+from lightning_pose.terminal import escape_markdown, format_markdown
 
 __all__ = ["as_latex", "as_markdown", "print_table"]
 
@@ -52,10 +53,9 @@ def print_table(report: Report, file: TextIO | None = None) -> None:
 
 def as_markdown(report: Report) -> str:
     """A table in Markdown, and below it a list of notes."""
-    headings, *rows = [[_escape_markdown(cell) for cell in line] for line in _format_table(report)]
-    aligned = ["---" if i < 2 else "---:" for i in range(len(headings))]
-    table = [f"| {' | '.join(row)} |" for row in (headings, aligned, *rows)]
-    return "\n".join([*table, "", *(f"- {_escape_markdown(note)}" for note in _list_notes(report))])
+    headings, *rows = _format_table(report)
+    table = re.sub(f"[{BOLD}{END}]", "**", format_markdown(headings, rows, texts=2))
+    return "\n".join([table, "", *(f"- {escape_markdown(note)}" for note in _list_notes(report))])
 
 
 def as_latex(report: Report) -> str:
@@ -67,10 +67,6 @@ def as_latex(report: Report) -> str:
         out += [line] if i and report.rows[i - 1].kind == row.kind else ["\\midrule", line]
     out += ["\\bottomrule", "\\end{tabular}", "\\par\\smallskip", "{\\footnotesize\\raggedright"]
     return "\n".join([*out, *(f"{_escape_latex(note)}\\par" for note in _list_notes(report)), "}"])
-
-
-def _escape_markdown(text: str) -> str:
-    return re.sub(f"[{BOLD}{END}]", "**", re.sub(r"([|*<\\])", r"\\\1", text))
 
 
 def _escape_latex(text: str) -> str:

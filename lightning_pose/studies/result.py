@@ -16,9 +16,9 @@ from lightning_pose.studies.table import Group, build_rows, read_groups, varying
 from lightning_pose.sweeps.base_config import ParsedConfig, open_keypoint_data
 from lightning_pose.sweeps.plan import Plan
 from lightning_pose.sweeps.space import SCENE, suggest_name
-from lightning_pose.terminal import Sheet
+from lightning_pose.terminal import Sheet, format_markdown
 
-__all__ = ["write_markdown", "write_study"]
+__all__ = ["write_study"]
 
 
 def write_study(study: Study, plan: Plan, spec: FigureSpec, folder: Path) -> tuple[list[Path], Sheet]:
@@ -48,14 +48,8 @@ def write_study(study: Study, plan: Plan, spec: FigureSpec, folder: Path) -> tup
     files = [folder / name for name in ("figure.png", "table.csv", "table.md")]
     figure.savefig(files[0])
     files[1].write_text(write_csv(groups, plan))
-    files[2].write_text(write_markdown(heads, rows))
+    files[2].write_text(format_markdown(heads, rows) + "\n")
     return files, Sheet(title, heads, rows)
-
-
-def write_markdown(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table as GitHub's Markdown."""
-    lines = [heads, ["---"] * len(heads), *rows]
-    return "".join("| " + " | ".join(text.replace("|", "\\|") for text in line) + " |\n" for line in lines)
 
 
 def _read_keypoints(plan: Plan, group: Group) -> tuple[str, FrameKeypoints]:

@@ -11,6 +11,7 @@ from lightning_pose.runs.logger import MLflowLogger
 from lightning_pose.runs.tags import RUN
 from lightning_pose.sweeps.plan import Plan
 from lightning_pose.sweeps.results import SHOWN, best_trials, count_states, format_value
+from lightning_pose.terminal import format_markdown
 
 __all__ = ["close_parent", "close_run", "describe_parent", "open_parent"]
 
@@ -49,18 +50,13 @@ def open_parent(study: Study, plan: Plan) -> tuple[MlflowClient, str]:
 
 def describe_parent(client: MlflowClient, run: str, study: Study, plan: Plan) -> None:
     """Make a table of the best trials the description of the study's run."""
-    names = [objective.metric for objective in plan.objectives]
-    lines = [
-        f"{count_states(study)}\n",
-        f"| trial | {' | '.join(names)} | settings |",
-        f"|---|{'---|' * len(names)}---|",
-    ]
+    rows = []
     for trial in best_trials(study, plan)[:SHOWN]:
-        values = " | ".join(format_value(value) for value in trial.values)
         # In one column, which wraps: a wide table pushes the rest off MLflow's page.
         settings = ", ".join(f"{key.partition('.')[2]} {format_value(value)}" for key, value in trial.params.items())
-        lines.append(f"| {trial.number} | {values} | {settings} |")
-    client.set_tag(run, "mlflow.note.content", "\n".join(lines))
+        rows.append([str(trial.number), *map(format_value, trial.values), settings])
+    table = format_markdown(["trial", *(objective.metric for objective in plan.objectives), "settings"], rows)
+    client.set_tag(run, "mlflow.note.content", f"{count_states(study)}\n\n{table}")
 
 
 def close_parent(client: MlflowClient, run: str, study: Study, status: str) -> None:

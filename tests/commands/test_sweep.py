@@ -19,6 +19,7 @@ from lightning_pose.sweeps.plan import read_plan
 from lightning_pose.sweeps.storage import hide_password
 from lightning_pose.sweeps.trial import EpochWatch
 from tests.helpers import REPOSITORY, Workplace
+from tests.processes import start_fork_server
 
 CONFIGS = sorted((REPOSITORY / "configs").glob("*.yaml"))
 SWEEPS = sorted((REPOSITORY / "sweeps").rglob("*.yaml"))
@@ -220,15 +221,16 @@ def test_two_objectives_have_a_pareto_front(workplace: Workplace, sweep_file: Sw
     assert (workplace.folder / "out" / "best.yaml").is_file()
 
 
-def test_workers_share_a_study_and_one_is_killed(workplace: Workplace, sweep_file: Sweep) -> None:
+def test_workers_share_a_study_and_one_is_killed(
+    workplace: Workplace, sweep_file: Sweep, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Exactly the points of the grid, each once, although a worker is killed in the middle of a trial."""
     killer = {"class_path": "tests.helpers.KillOnce", "init_args": {"marker": str(workplace.folder / "killed")}}
     settings = {"trainer.max_epochs": 2, "trainer.callbacks": [killer]}
     file = sweep_file(sampler="grid", space={"model.units": [4, 5, 6]}, settings=settings, pruner="none")
-    # In a process of its own: workers keep the environment of the first sweep in a process.
-    with workplace.start("sweep", file, "--workers", "2") as command:
-        _, errors = command.communicate(timeout=200)
-    assert command.returncode == 0, errors
+    start_fork_server()
+    assert workplace.command("sweep", file, "--workers", "2") == 0
+    errors = capsys.readouterr().err
     assert "trial 3/3" in errors
     assert re.search(r"^the process of trial \d died; it is run again as trial 3$", errors, re.MULTILINE)
     complete = [trial for trial in trials(workplace) if trial.state == TrialState.COMPLETE]

@@ -185,7 +185,7 @@ class WallProblem(LearnableProblem):
             of `WALL_CAMERA` that is not known.
     """
 
-    def __init__(self, input_shape: list[int], count: int = 24, cameras: Sequence[str | None] = (WALL_CAMERA,)) -> None:
+    def __init__(self, input_shape: list[int], count: int = 12, cameras: Sequence[str | None] = (WALL_CAMERA,)) -> None:
         super().__init__(input_shape, count)
         self.extractor = SURF(input_shape[0], with_geometry=True)
         self.cameras = list(cameras)
@@ -220,7 +220,7 @@ class WallProblem(LearnableProblem):
 class RefinableProblem(WallProblem):
     """Frames of a wall whose features are (D,) numbers that show the pose roughly, beside the wall's keypoints."""
 
-    def __init__(self, columns: int = 16, count: int = 24) -> None:
+    def __init__(self, columns: int = 16, count: int = 12) -> None:
         super().__init__([WALL_KEYPOINTS, 36], count)
         self.keypoints = self.splits
         mix = torch.randn(7, columns, generator=torch.Generator().manual_seed(1))

@@ -21,7 +21,7 @@ from tests.models.helpers import WALL_CAMERA, WALL_KEYPOINTS, WallProblem
 
 
 def fit_wall(problem: WallProblem | None = None, **settings: object) -> tuple[LandmarkMap, WallProblem]:
-    problem = problem or WallProblem([WALL_KEYPOINTS, 36], count=30)
+    problem = problem or WallProblem([WALL_KEYPOINTS, 36])
     model = LandmarkMap(**{"input_shape": [WALL_KEYPOINTS, 36], "bundle_adjust": False, **settings})  # type: ignore[arg-type]
     trainer = Trainer(
         max_epochs=1, accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False,
@@ -43,10 +43,10 @@ def test_test_frames_are_located_to_a_centimetre(fitted: tuple[LandmarkMap, Wall
 
 
 def test_without_a_camera_the_focal_length_is_found_and_printed(capsys: pytest.CaptureFixture[str]) -> None:
-    model, problem = fit_wall(WallProblem([WALL_KEYPOINTS, 36], count=30, cameras=[None]))
+    model, problem = fit_wall(WallProblem([WALL_KEYPOINTS, 36], cameras=[None]))
     printed = capsys.readouterr().out
     assert "the camera is unknown: a focal length of" in printed
-    assert "map of 60 frames" in printed
+    assert "map of 24 frames" in printed
     assert model.network.view.focal_px == pytest.approx(500, rel=0.03)
     data = problem.dataset("test").data
     assert position_error_m(model(data.features).position_m, data.position_m).median() < 0.03
@@ -58,7 +58,7 @@ def test_each_frame_has_its_own_camera(capsys: pytest.CaptureFixture[str]) -> No
         "OPENCV,1280,960,1000,1010,650,470,-0.2,0.05,0.001,-0.002",
         "OPENCV_FISHEYE,320,240,220,225,150,125,0.05,0,0,0",
     ]
-    model, problem = fit_wall(WallProblem([WALL_KEYPOINTS, 36], count=30, cameras=cameras))
+    model, problem = fit_wall(WallProblem([WALL_KEYPOINTS, 36], count=20, cameras=cameras))
     assert "2 cameras; images that come without one are located as if by" in capsys.readouterr().out
     data = problem.dataset("test").data
     error = position_error_m(model.predict_step(data, 0).position_m, data.position_m)
@@ -136,7 +136,7 @@ def test_frames_of_which_nothing_can_be_triangulated_are_refused() -> None:
     problem = WallProblem([WALL_KEYPOINTS, 36])
     frames = problem.scene.frames
     problem._scene = replace(problem.scene, frames=tuple(replace(f, position_m=np.zeros(3)) for f in frames))
-    with pytest.raises(DataError, match=r"no point of wall could be triangulated from 24 frames.*check"):
+    with pytest.raises(DataError, match=r"no point of wall could be triangulated from 12 frames.*check"):
         fit_wall(problem)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from lightning_pose.errors import ConfigError
-from lightning_pose.reports.filters import Filters, read_date, select_runs
+from lightning_pose.reports.filters import read_date, select_runs
 from lightning_pose.runs.reader import Run, read_runs
 from tests.stores import FakeRun, make_store
 
@@ -26,14 +26,14 @@ def runs(tmp_path: Path, store: Path) -> list[Run]:
 
 
 def days(runs: list[Run], **filters: object) -> list[int]:
-    kept, _ = select_runs(runs, Filters(**filters))  # type: ignore[arg-type]
+    kept, _ = select_runs(runs, **filters)  # type: ignore[arg-type]
     return sorted([1, 5, 9, 11, 20][int(run.run_id, 16)] for run in kept)
 
 
 def test_untested_runs_and_trials_are_left_out(runs: list[Run]) -> None:
     assert days(runs) == [1, 5, 9]
-    assert select_runs(runs, Filters())[1] == ["1 of 4 runs have no test errors, as most trials of sweeps: left out"]
-    assert select_runs(runs, Filters(trials=True))[1][0].startswith("2 of 5 runs")
+    assert select_runs(runs)[1] == ["1 of 4 runs have no test errors, as most trials of sweeps: left out"]
+    assert select_runs(runs, trials=True)[1][0].startswith("2 of 5 runs")
 
 
 @pytest.mark.parametrize(
@@ -80,9 +80,9 @@ def test_nothing_passes(runs: list[Run], filters: dict[str, object], says: str) 
 def test_nothing_but_trials(runs: list[Run]) -> None:
     trials = [run for run in runs if run.trial]
     with pytest.raises(ConfigError, match="all 1 finished runs are trials of sweeps; give --trials"):
-        select_runs(trials, Filters())
+        select_runs(trials)
     with pytest.raises(ConfigError, match=r"none of the 1 runs has test errors \(trials of a sweep never see"):
-        select_runs(trials, Filters(trials=True))
+        select_runs(trials, trials=True)
 
 
 @pytest.mark.parametrize("text", ["yesterday", "2026-13-01", "01.03.2026"])

@@ -91,6 +91,14 @@ def test_a_run_stopped_after_its_last_epoch_goes_on_to_its_test(early: bool, wor
     assert all(torch.equal(value, before[name]) for name, value in read_weights(workplace).items())
 
 
+@pytest.fixture(scope="module")
+def stopped(tmp_path_factory: pytest.TempPathFactory, scene: Path, store: Path) -> Workplace:
+    """A run that was stopped in its second epoch; a refusal leaves it as it is."""
+    workplace = Workplace.make(tmp_path_factory.mktemp("stopped") / "workplace", scene, store)
+    stop_run(workplace, *stop_at("tests.helpers.FailAt", 1))
+    return workplace
+
+
 @pytest.mark.parametrize(
     ("option", "says"),
     [
@@ -105,14 +113,20 @@ def test_a_run_stopped_after_its_last_epoch_goes_on_to_its_test(early: bool, wor
     ],
 )
 def test_other_settings_are_refused(
-    option: list[str], says: str, workplace: Workplace, capsys: pytest.CaptureFixture[str]
+    option: list[str], says: str, stopped: Workplace, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run = stop_run(workplace, *stop_at("tests.helpers.FailAt", 1))
-    assert workplace.run("fit", "--ckpt_path", "last", *option) == 2
+    (run,) = stopped.runs()
+    assert stopped.run("fit", "--ckpt_path", "last", *option) == 2
     assert says in capsys.readouterr().err.splitlines()[-1]
-    (same,) = workplace.runs()
-    assert same.data.params == run.data.params
+    (same,) = stopped.runs()
+    assert (same.info.status, same.data.params) == ("FAILED", run.data.params)
+
+
+def test_settings_that_change_no_result_may_differ(workplace: Workplace) -> None:
+    stop_run(workplace, *stop_at("tests.helpers.FailAt", 1))
     assert workplace.run("fit", "--ckpt_path", "last", "--data.eval_batch_size", "3") == 0
+    (run,) = workplace.runs()
+    assert run.info.status == "FINISHED"
 
 
 def test_the_folders_of_the_data_may_have_moved(workplace: Workplace) -> None:

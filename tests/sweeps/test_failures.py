@@ -7,6 +7,7 @@ import os
 import signal
 import socket
 import subprocess
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -29,6 +30,7 @@ from lightning_pose.sweeps.plan import Plan, read_plan
 from lightning_pose.sweeps.study import open_storage, open_study, queue_again, recover_trials
 from lightning_pose.sweeps.trial import EpochWatch, run_trial
 from tests.helpers import Workplace
+from tests.processes import start_fork_server
 
 STUDY = "units-wall"
 BOTH = ["val/position_median_m", "val/orientation_median_deg"]
@@ -77,17 +79,19 @@ class ExitOnce(Callback):
         time.sleep(0.5)
 
 
-def test_trials_under_way_are_finished_when_a_worker_breaks(workplace: Workplace) -> None:
+def test_trials_under_way_are_finished_when_a_worker_breaks(
+    workplace: Workplace, capsys: pytest.CaptureFixture[str]
+) -> None:
     breaker = {
         "class_path": "tests.sweeps.test_failures.ExitOnce",
         "init_args": {"marker": str(workplace.folder / "x")},
     }
     settings = {"trainer.callbacks": [breaker], "trainer.max_epochs": 1}
     file = write(workplace, sampler="grid", space={"model.units": [4, 5, 6, 7]}, settings=settings)
-    with workplace.start("sweep", file, "--workers", "2") as command:
-        _, errors = command.communicate(timeout=200)
-    assert "RuntimeError: a worker of the sweep broke" in errors
-    assert "the sweep breaks off; trials under way are finished first" in errors
+    start_fork_server()
+    with pytest.raises(RuntimeError, match="a worker of the sweep broke"):
+        workplace.command("sweep", file, "--workers", "2")
+    assert "the sweep breaks off; trials under way are finished first" in capsys.readouterr().err
     found = sorted(states(optuna.load_study(study_name=STUDY, storage=address(workplace))))
     assert found in (["COMPLETE", "RUNNING", "WAITING", "WAITING"], ["RUNNING", "WAITING", "WAITING", "WAITING"])
 
@@ -201,19 +205,25 @@ def test_a_ctrl_c_in_a_trial_that_another_process_has_failed_ends_the_sweep(
     assert states(study) == ["FAIL"], "the process that failed it has queued it again"
 
 
+def press_ctrl_c_once_two_wait(folder: Path) -> None:
+    """Press Ctrl-C in this process alone, which passes it on to its workers."""
+    deadline = time.monotonic() + 200
+    while len(list(folder.glob("waits-*"))) < 2 and time.monotonic() < deadline:
+        time.sleep(0.05)
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+@pytest.mark.usefixtures("_ctrl_c")
 def test_ctrl_c_in_the_middle_of_two_workers_trials(workplace: Workplace, capsys: pytest.CaptureFixture[str]) -> None:
     """Each is queued again, and the next command runs it to its end."""
     waiter = {"class_path": "tests.helpers.WaitAt", "init_args": {"folder": str(workplace.folder)}}
     file = write(workplace, sampler="grid", space={"model.units": [4, 5]}, settings={"trainer.callbacks": [waiter]})
-    with workplace.start("sweep", file, "--workers", "2") as first:
-        deadline = time.monotonic() + 200
-        while len(list(workplace.folder.glob("waits-*"))) < 2:
-            assert first.poll() is None, first.communicate()[1]
-            assert time.monotonic() < deadline
-            time.sleep(0.05)
-        first.send_signal(signal.SIGINT)  # to the command alone, which passes it on
-        _, errors = first.communicate(timeout=200)
-    assert first.returncode == 130, errors
+    start_fork_server()
+    finger = threading.Thread(target=press_ctrl_c_once_two_wait, args=(workplace.folder,))
+    finger.start()
+    assert workplace.command("sweep", file, "--workers", "2") == 130
+    finger.join()
+    errors = capsys.readouterr().err
     assert "interrupted; the same command goes on" in errors
     assert "Traceback" not in errors
     study = optuna.load_study(study_name=STUDY, storage=address(workplace))
@@ -237,7 +247,7 @@ def test_workers_of_a_killed_command_finish_their_trials_and_end(workplace: Work
     file = write(
         workplace, sampler="grid", space={"model.units": [4, 5, 6, 7]}, settings={"trainer.callbacks": [waiter]}
     )
-    with workplace.start("sweep", file, "--workers", "2") as command:
+    with workplace.fork("sweep", file, "--workers", "2") as command:
         deadline = time.monotonic() + 200
         while len(list(workplace.folder.glob("waits-*"))) < 2:
             assert time.monotonic() < deadline

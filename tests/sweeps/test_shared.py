@@ -25,6 +25,7 @@ from lightning_pose.sweeps.plan import read_plan
 from lightning_pose.sweeps.space import draw_values
 from lightning_pose.sweeps.study import SAMPLERS, load_study, open_storage, open_study
 from tests.helpers import Workplace
+from tests.processes import start_fork_server
 
 SPACE = {
     "model.units": {"type": "int", "low": 4, "high": 40},
@@ -77,6 +78,7 @@ def test_grid_points_that_others_take_are_not_replaced(
         run(*args)
 
     monkeypatch.setattr(runners, name, run_the_rest)
+    start_fork_server()
     file = write(workplace, sampler="grid", space={"model.units": [4, 5, 6]})
     assert workplace.command("sweep", file, "--workers", str(workers)) == 0
     assert "trial 1/3" in capsys.readouterr().err

@@ -102,7 +102,11 @@ def moved_problem(model: PoseModule, shift: torch.Tensor, scale: float) -> Learn
 def trained(architecture: type[PoseModule], shift: torch.Tensor, scale: float) -> torch.Tensor:
     """Positions in the original world that a model predicts which was trained in the moved one."""
     torch.manual_seed(0)
-    settings = {"lambdas": [1e-3]} if issubclass(architecture, LinearPoseNet | KernelPoseNet) else {}
+    settings: dict[str, object] = {}
+    if issubclass(architecture, LinearPoseNet | KernelPoseNet):
+        settings = {"lambdas": [1e-3]}
+    elif architecture is CNNRNN:
+        settings = {"channels": 16, "units": 30}
     model = make_model(architecture, **settings)
     problem = moved_problem(model, shift, scale)
     trainer = Trainer(
