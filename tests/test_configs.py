@@ -64,7 +64,8 @@ def test_it_trains_tests_and_keeps_its_results(
     for system in [run.data.tags["architecture"], *baselines]:
         assert f" {system} " in table
     of_map = MAP_FIGURES if "test/accepted" in run.data.metrics else set()
-    _check_artifacts(workplace, run.info.run_id, room, FIGURES[kind] | of_map)
+    of_radii = {"calibration.png"} if "test/coverage_position" in run.data.metrics else set()
+    _check_artifacts(workplace, run.info.run_id, room, FIGURES[kind] | of_map | of_radii)
 
 
 def _check_record(status: str, metrics: dict[str, float], tags: dict[str, str], baselines: list[str]) -> None:

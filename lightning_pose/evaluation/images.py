@@ -14,9 +14,10 @@ from lightning_pose.data.batches import PoseBatch
 from lightning_pose.data.datamodule import SceneDataModule, scene_datamodule
 from lightning_pose.evaluation.baselines.images import BaselineResult, evaluate_baselines
 from lightning_pose.evaluation.costs import costs
-from lightning_pose.evaluation.maps import MapEvaluation, evaluate_map
+from lightning_pose.evaluation.maps import MapEvaluation, evaluate_map, measure_coverage
 from lightning_pose.evaluation.result import Evaluation, skill
 from lightning_pose.figures import images as image_figures
+from lightning_pose.figures.maps import draw_calibration
 from lightning_pose.geometry.quaternions import orientation_error_deg, position_error_m
 from lightning_pose.metrics.catalog import MEDIANS, reference_baseline
 from lightning_pose.metrics.summary import summarize_errors
@@ -27,8 +28,8 @@ from lightning_pose.scenes.scene import Scene
 
 __all__ = ["evaluate_images"]
 
-ALONE_BATCH = 64
-"""Frames that a refined system's network locates at once."""
+CHUNK = 64
+"""Frames that a network is asked for at once."""
 
 
 def evaluate_images(trainer: Trainer, module: PoseModule, located: Located, model: Mapping[str, float]) -> Evaluation:
@@ -76,7 +77,7 @@ def _evaluate_map(module: PoseModule, prediction: Pose, scene: Scene, test: Pose
         return evaluate_map(module.network, answers, module.world_frame, prediction, scene, test, module.system_name)
     refinement = module.refinement
     if refinement is None or not refinement.has_map:
-        return MapEvaluation({}, {}, {})
+        return _evaluate_radius(module, prediction, scene, test)
     answers = refinement.locate_frames(test.frame.tolist())
     found = evaluate_map(refinement.network, answers, module.world_frame, prediction, scene, test, module.system_name)
     alone = _measure_alone(module, test)
@@ -85,9 +86,26 @@ def _evaluate_map(module: PoseModule, prediction: Pose, scene: Scene, test: Pose
 
 
 @torch.inference_mode()
+def _evaluate_radius(module: PoseModule, prediction: Pose, scene: Scene, test: PoseBatch) -> MapEvaluation:
+    """How well the radii of a regressor hold its errors; empty where it has none."""
+    if module.radius is None:
+        return MapEvaluation({}, {}, {})
+    parts = [module.radius.find_radii(chunk.to(module.device)) for chunk in test.features.split(CHUNK)]
+    radii = torch.cat([part[0] for part in parts]).numpy(), torch.cat([part[1] for part in parts]).numpy()
+    errors = (
+        position_error_m(prediction.position_m.double(), test.position_m.double()).numpy(),
+        orientation_error_deg(prediction.quat_wxyz.double(), test.quat_wxyz.double()).numpy(),
+    )
+    metrics = measure_coverage(errors, radii)
+    about = f"{module.system_name} on {scene.name}"
+    figures = {"calibration": draw_calibration(errors, radii, title=about, unit=scene.unit)} if metrics else {}
+    return MapEvaluation(metrics, {}, figures)
+
+
+@torch.inference_mode()
 def _measure_alone(module: PoseModule, test: PoseBatch) -> dict[str, float]:
     """The errors of a refined system's own network, which is asked again: `test_step` returned refined poses."""
-    parts = [module(features.to(module.device)) for features in test.features.split(ALONE_BATCH)]
+    parts = [module(features.to(module.device)) for features in test.features.split(CHUNK)]
     position, quat = (torch.cat(tensors).cpu().double() for tensors in zip(*parts, strict=True))
     return summarize_errors(
         position_error_m(position, test.position_m.double()), orientation_error_deg(quat, test.quat_wxyz.double())

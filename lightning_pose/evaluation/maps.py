@@ -19,7 +19,10 @@ from lightning_pose.models.parts.map_network import MapNetwork
 from lightning_pose.models.parts.world_frame import WorldFrame
 from lightning_pose.scenes.scene import Scene
 
-__all__ = ["MapEvaluation", "evaluate_map"]
+__all__ = ["MapEvaluation", "evaluate_map", "measure_coverage"]
+
+Errors = tuple[np.ndarray, np.ndarray]
+"""Of positions (N,) in the scene's unit, and of orientations (N,) in degrees."""
 
 
 @dataclass
@@ -72,11 +75,8 @@ def evaluate_map(
         rows[f"of these {accepted.mean():.0%} accepted"] = held
         metrics["test/accepted_position_median_m"] = held["position_median_m"]
         metrics["test/accepted_orientation_median_deg"] = held["orientation_median_deg"]
-    if accepted.any() and np.isfinite(radius_m[accepted]).all():
-        metrics["test/coverage_position"] = float((position <= radius_m)[accepted].mean())
-        metrics["test/coverage_orientation"] = float((orientation <= radius_deg)[accepted].mean())
-        metrics["test/radius_median_m"] = float(np.median(radius_m[accepted]))
-        metrics["test/radius_median_deg"] = float(np.median(radius_deg[accepted]))
+    found = measure_coverage((position[accepted], orientation[accepted]), (radius_m[accepted], radius_deg[accepted]))
+    metrics |= found
     about = f"{name} on {scene.name}"
     point_map = network.point_map
     points, training = (world_frame.to_world(torch.from_numpy(each)).numpy() for each in (
@@ -88,7 +88,7 @@ def evaluate_map(
             position, np.array([answer.inliers for answer in answers]), accepted, title=about, unit=scene.unit
         ),
     }
-    if "test/coverage_position" in metrics:
+    if found:
         figures["calibration"] = map_figures.draw_calibration(
             (position[accepted], orientation[accepted]),
             (radius_m[accepted], radius_deg[accepted]),
@@ -96,3 +96,13 @@ def evaluate_map(
             unit=scene.unit,
         )
     return MapEvaluation(metrics, rows, figures)
+
+
+def measure_coverage(errors: Errors, radii: Errors) -> dict[str, float]:
+    """How many of (N,) errors lie within their radii, and the median radii; nothing where radii are unknown."""
+    if not len(errors[0]) or not np.isfinite(radii).all():
+        return {}
+    inside = [float((error <= radius).mean()) for error, radius in zip(errors, radii, strict=True)]
+    names = ("coverage_position", "coverage_orientation", "radius_median_m", "radius_median_deg")
+    values = (*inside, *(float(np.median(radius)) for radius in radii))
+    return {f"test/{name}": value for name, value in zip(names, values, strict=True)}

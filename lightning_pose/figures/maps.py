@@ -100,7 +100,7 @@ def draw_error_vs_inliers(
 def draw_calibration(
     errors: tuple[np.ndarray, np.ndarray], radii: tuple[np.ndarray, np.ndarray], title: str = "", unit: str = "m"
 ) -> Figure:
-    """The share of accepted frames whose error lies within a multiple of their 90 % radius; at 1 it should be 90 %.
+    """The share of frames whose error lies within a multiple of their 90 % radius; at 1 it should be 90 %.
 
     Args:
         errors: of positions and orientations (degrees), (N,) each.
@@ -118,7 +118,7 @@ def draw_calibration(
         axes.plot(ratio, np.arange(1, len(ratio) + 1) / len(ratio), drawstyle="steps-post", color=color, label=label)
     axes.axvline(1, color=TRUTH, linewidth=1, linestyle=(0, (5, 3)))
     axes.axhline(0.9, color=TRUTH, linewidth=1, linestyle=(0, (5, 3)))
-    axes.set(xlabel="error by radius", ylabel="share of accepted frames", xlim=(0, 3), ylim=(0, 1.02))
+    axes.set(xlabel="error by radius", ylabel="share of frames", xlim=(0, 3), ylim=(0, 1.02))
     axes.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
     axes.legend(loc="lower right")
     return figure

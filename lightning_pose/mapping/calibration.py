@@ -12,7 +12,15 @@ from lightning_pose.mapping.build_map import MappedFrames, summarize_tracks, tri
 from lightning_pose.mapping.frames import MapFrames
 from lightning_pose.mapping.map_localizer import MapAnswer, MapLocalizer
 
-__all__ = ["UNKNOWN", "Calibration", "Measured", "calibrate_map", "measure_answers", "measure_frames"]
+__all__ = [
+    "UNKNOWN",
+    "Calibration",
+    "Measured",
+    "calibrate_map",
+    "find_conformal_factor",
+    "measure_answers",
+    "measure_frames",
+]
 
 BLOCKS = 5
 """Parts of the training frames, each consecutive, left out in turn."""
@@ -73,8 +81,8 @@ def calibrate_map(mapped: MappedFrames) -> Calibration:
         return UNKNOWN
     every = Measured(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
     return Calibration(
-        _find_quantile((every.position / every.position_sd)[every.accepted]),
-        _find_quantile((every.orientation_deg / every.orientation_sd_deg)[every.accepted]),
+        find_conformal_factor((every.position / every.position_sd)[every.accepted]),
+        find_conformal_factor((every.orientation_deg / every.orientation_sd_deg)[every.accepted]),
         float(np.median(every.position)),
         float(np.median(every.orientation_deg)),
         float(every.accepted.mean()),
@@ -112,7 +120,7 @@ def measure_answers(answers: Sequence[MapAnswer], frames: MapFrames) -> Measured
     )
 
 
-def _find_quantile(ratios: np.ndarray) -> float:
+def find_conformal_factor(ratios: np.ndarray) -> float:
     """The smallest value that at least 90 % of further ratios would not exceed; nan for too few ratios."""
     if len(ratios) < MIN_ANSWERS:
         return np.nan

@@ -196,6 +196,8 @@ class PoseModule(RefinedModule, StandardizedModule):
             self.divergence.spread_m = float((position - position.mean(0)).norm(dim=-1).mean())
             self.fit_scale(position.to(self.pose_mean), quat_wxyz.to(self.quat_reference))
             self.fit_feature_scale(train.data.features)
+            if self.radius is not None:
+                self.radius.set_training(train.data.features)
 
     def fit_world_frame(self, train: PoseDataset) -> None:
         """Choose the origin and the scale of the positions of the training split."""
@@ -239,13 +241,16 @@ class PoseModule(RefinedModule, StandardizedModule):
         """The poses, in the world, of a batch of validation or test, with their errors and losses collected."""
         terms, position, quat_raw = self._compare(batch, by_item=True)
         to_world = self.world_frame.to_world
-        pose = self.refine_pose(batch.frame, Pose(to_world(position), quat_normalize(quat_raw)))
+        alone = Pose(to_world(position), quat_normalize(quat_raw))
+        pose = self.refine_pose(batch.frame, alone)
         check_poses(Located(batch.frame, *pose), type(self).__name__, self._remedy)
         losses.update(terms, key_items(batch.frame))
         keys = key_poses(batch.frame)
         # As poses with one column, because the judged part is cut from them likewise.
         judged = self.select_judged(Pose(keys.unsqueeze(-1), keys.unsqueeze(-1))).position_m.squeeze(-1)
         truth = self.select_judged(Pose(to_world(batch.position_m), batch.quat_wxyz))
+        if metrics is self.val_metrics:
+            self.add_errors(batch.features, alone, truth)
         metrics.update(*self.select_judged(pose), *truth, judged)
         return pose
 
@@ -273,6 +278,7 @@ class PoseModule(RefinedModule, StandardizedModule):
         return Located(batch.frame, *pose)
 
     def on_validation_epoch_end(self) -> None:
+        self.calibrate_radius()
         self._log_metrics(self.val_metrics, self.val_losses, "val")
 
     def on_test_epoch_end(self) -> None:

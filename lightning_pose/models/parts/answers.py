@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
+from torch import Tensor
 
 from lightning_pose.mapping.map_localizer import MapAnswer
 from lightning_pose.models.parts.map_network import MapNetwork
@@ -45,12 +46,13 @@ class Answers:
         return len(self.source)
 
 
-def answer_by_network(pose: Pose) -> Answers:
-    """(M,) poses of a network, with unknown radii."""
+def answer_by_network(pose: Pose, radius_m: Tensor | None = None, radius_deg: Tensor | None = None) -> Answers:
+    """(M,) poses of a network, with the radii of their errors where they are known."""
     count = len(pose.position_m)
     unknown = np.full(count, np.nan)
+    radii = (unknown if radius is None else radius.numpy() for radius in (radius_m, radius_deg))
     position_m, quat_wxyz = (part.detach().cpu().numpy() for part in pose)
-    return Answers(position_m, quat_wxyz, ("network",) * count, ("",) * count, unknown, unknown)
+    return Answers(position_m, quat_wxyz, ("network",) * count, ("",) * count, *radii)
 
 
 def answer_by_map(

@@ -13,8 +13,10 @@ from torch import Tensor
 from lightning_pose.data.datamodule import SceneDataModule, scene_datamodule
 from lightning_pose.errors import CheckpointError, ConfigError, DataError
 from lightning_pose.geometry.camera import Camera
+from lightning_pose.geometry.quaternions import orientation_error_deg, position_error_m
 from lightning_pose.models.parts.answers import Answers, answer_by_map, answer_by_network, replace_accepted
 from lightning_pose.models.parts.checkpoint_hooks import CheckpointHooks
+from lightning_pose.models.parts.error_radius import ErrorRadius
 from lightning_pose.models.parts.frame_cameras import scale_cameras
 from lightning_pose.models.parts.poses import Pose
 from lightning_pose.models.parts.refinement import MapRefinement, MapSettings
@@ -36,11 +38,14 @@ class RefinedModule(CheckpointHooks):
 
     Attributes:
         refinement: the map; None without `refine`.
+        radius: of the errors of the regressor's own poses; None for architectures that take no map.
         refusal: why this architecture takes no map; empty where it does.
     """
 
     refusal: ClassVar[str] = ""
     refinement: MapRefinement | None
+    radius: ErrorRadius | None
+    input_shape: tuple[int, ...]
     world_frame: WorldFrame
 
     def register_refinement(self, refine: bool | MapSettings | Mapping[str, Any]) -> None:
@@ -54,6 +59,7 @@ class RefinedModule(CheckpointHooks):
             raise ConfigError(f"model.refine is on, but {type(self).__name__} {self.refusal}; leave it out")
         self.hparams["refine"] = False if settings is None else asdict(settings)
         self.refinement = None if settings is None else MapRefinement(settings)
+        self.radius = None if self.refusal else ErrorRadius(self.input_shape)
 
     @property
     def system_name(self) -> str:
@@ -85,6 +91,24 @@ class RefinedModule(CheckpointHooks):
             refinement.fit(splits, calibrate)
         except DataError as error:  # no texture, or poses that do not fit the images
             _log.warning("no map refines this %s: %s", type(self).__name__, error)
+
+    def add_errors(self, features: Tensor, pose: Pose, truth: Pose) -> None:
+        """Add a validation batch of the regressor's own poses, in the world, to what its radii are found from."""
+        if self.radius is not None and not self.trainer.sanity_checking:
+            errors = (
+                position_error_m(pose.position_m, truth.position_m),
+                orientation_error_deg(pose.quat_wxyz.double(), truth.quat_wxyz.double()),
+            )
+            self.radius.add_errors(features, *errors)
+
+    def calibrate_radius(self) -> None:
+        """Find the radii from the validation epoch, of which every process has a share."""
+        if self.radius is not None and not self.trainer.sanity_checking:
+            scores = self.radius.take_scores()
+            if self.trainer.world_size > 1:
+                scores = self.all_gather(scores).flatten(0, -2)
+            if self.trainer.state.fn == "fit":  # other validation frames may be known to the regressor
+                self.radius.calibrate(scores)
 
     @property
     def _learns_val(self) -> bool:
@@ -123,7 +147,7 @@ class RefinedModule(CheckpointHooks):
         if self.refinement is None and camera is not None:
             raise ConfigError(f"{type(self).__name__} does not use cameras; leave camera out")
         pose: Pose = self(features)
-        alone = answer_by_network(pose)
+        alone = answer_by_network(pose, *(() if self.radius is None else self.radius.find_radii(features)))
         if self.refinement is None or not self.refinement.has_map or keypoints is None:
             return alone
         network = self.refinement.network
@@ -138,6 +162,8 @@ class RefinedModule(CheckpointHooks):
             CheckpointError: as `CheckpointHooks`, or `refine` asks for a map, and the checkpoint has none.
         """
         state = checkpoint["state_dict"]
+        if self.radius is not None:
+            self.radius.resize({name.removeprefix("radius."): value for name, value in state.items()})
         own = {name.removeprefix(PREFIX): value for name, value in state.items() if name.startswith(PREFIX)}
         if self.refinement is None:
             checkpoint["state_dict"] = {name: value for name, value in state.items() if not name.startswith(PREFIX)}

@@ -1,0 +1,122 @@
+"""ErrorRadius: how far a regressor's poses may be off, from how far an image is from the training images."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from lightning_pose.mapping.calibration import find_conformal_factor
+from lightning_pose.models.parts.memory import resize_tensors
+
+__all__ = ["ErrorRadius"]
+
+DIMENSIONS = 16
+"""Numbers that are kept of each training image: a file of 1000 images grows by 32 kB."""
+
+MOST = 1000
+"""Training images that are kept, evenly spaced."""
+
+CELLS = 8
+"""Pixels of an image are averaged over so many rows and columns."""
+
+BUFFERS = ("reference", "mean", "floor", "factors")
+
+
+class ErrorRadius(nn.Module):
+    """Radii that hold 90 % of the errors of positions and orientations, by split conformal prediction.
+
+    The radius of an image is a factor times (d + the median of d): d is its distance to the nearest training image in
+    feature space, after a random projection. The factors are quantiles of error by (d + median) on validation frames
+    (normalized conformal prediction: Papadopoulos, Gammerman, Vovk, 2008). They hold for further frames that are to the
+    training frames as the validation frames are.
+
+    Args:
+        input_shape: of one frame's features.
+    """
+
+    reference: Tensor
+    mean: Tensor
+    floor: Tensor
+    factors: Tensor
+    signs: Tensor
+
+    def __init__(self, input_shape: tuple[int, ...]) -> None:
+        super().__init__()
+        self.input_shape = input_shape
+        width = _pool_features(torch.zeros(1, *input_shape)).shape[1]
+        bits = np.random.PCG64(0).random_raw(-(-width * DIMENSIONS // 64)).view(np.uint8)
+        signs = np.unpackbits(bits)[: width * DIMENSIONS].reshape(width, DIMENSIONS).astype(np.float32) * 2 - 1
+        self.register_buffer("signs", torch.from_numpy(signs / np.float32(DIMENSIONS**0.5)), persistent=False)
+        self.register_buffer("reference", torch.zeros(0, DIMENSIONS))
+        self.register_buffer("mean", torch.zeros(width))
+        self.register_buffer("floor", torch.zeros(()))
+        self.register_buffer("factors", torch.full((2,), torch.nan))
+        self._scores: list[Tensor] = []
+        self.register_load_state_dict_pre_hook(_fit_before_load)
+
+    def set_training(self, features: Tensor) -> None:
+        """Keep (M, *input_shape) features of training images, in few numbers each."""
+        kept = torch.linspace(0, len(features) - 1, min(MOST, len(features))).round().long()
+        pooled = torch.cat([_pool_features(chunk) for chunk in features[kept].split(64)]).to(self.mean)
+        self.mean = pooled.mean(0)
+        self.reference = (pooled - self.mean) @ self.signs
+
+    def measure_distance(self, features: Tensor) -> Tensor:
+        """(B,) distances of (B, *input_shape) features to the nearest training image."""
+        keys = (_pool_features(features).to(self.mean) - self.mean) @ self.signs
+        return torch.cdist(keys.float(), self.reference.float()).amin(1)
+
+    def add_errors(self, features: Tensor, position_error: Tensor, orientation_error_deg: Tensor) -> None:
+        """Add a validation batch, (B,) errors each."""
+        errors = torch.stack([position_error, orientation_error_deg], dim=1)
+        self._scores.append(torch.cat([self.measure_distance(features)[:, None], errors.float()], dim=1).detach())
+
+    def take_scores(self) -> Tensor:
+        """(N, 3) distances and errors that were added; they are dropped."""
+        scores, self._scores = torch.cat([self.reference.new_zeros(0, 3), *self._scores]), []
+        return scores
+
+    def calibrate(self, scores: Tensor) -> None:
+        """Find the factors from (N, 3) distances and errors; nan from too few."""
+        if not len(scores):
+            return
+        distance, *errors = scores.double().cpu().T
+        self.floor.fill_(float(distance.median()))
+        scale = (distance + distance.median()).clamp(min=1e-9).numpy()
+        factors = [find_conformal_factor(error.numpy() / scale) for error in errors]
+        self.factors.copy_(torch.tensor(factors))
+
+    def find_radii(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """(B,) radii in the scene's unit and in degrees; nan where they are unknown."""
+        if not len(self.reference):
+            unknown = torch.full((len(features),), torch.nan)
+            return unknown, unknown
+        scale = (self.measure_distance(features) + self.floor).double().cpu()
+        position, orientation = self.factors.tolist()
+        return scale * position, scale * orientation
+
+    def resize(self, state_dict: dict[str, Tensor]) -> None:
+        """Make room for the training images of a state dict."""
+        resize_tensors(self, ("reference",), state_dict)
+
+
+def _pool_features(features: Tensor) -> Tensor:
+    """(B, D) unit vectors of features (B, D), (B, N, D) of keypoints, (B, C, H, W) maps, or images of few channels."""
+    features = features.float()
+    if features.ndim == 3:
+        features = features.sum(1)
+    elif features.ndim == 4:
+        small = features.shape[1] <= 4
+        features = F.adaptive_avg_pool2d(features, CELLS if small else 1).flatten(1)
+    return F.normalize(features, dim=1)
+
+
+def _fit_before_load(module: nn.Module, state_dict: dict[str, Tensor], prefix: str, *_: object) -> None:
+    """Make room for a checkpoint's training images; an older checkpoint has none, so that radii are unknown."""
+    assert isinstance(module, ErrorRadius)
+    for name in BUFFERS:
+        empty = getattr(module, name)
+        state_dict.setdefault(f"{prefix}{name}", empty[:0] if name == "reference" else empty)
+    module.resize({name.removeprefix(prefix): value for name, value in state_dict.items() if name.startswith(prefix)})

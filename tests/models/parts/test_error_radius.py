@@ -1,0 +1,69 @@
+"""Radii of a regressor's errors: coverage where errors grow with the distance, layouts of features, checkpoints."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from lightning_pose.models import LinearPoseNet
+from lightning_pose.models.parts.error_radius import ErrorRadius
+
+
+def draw_frames(count: int, seed: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Features (count, 32) at several distances from (0, ..., 0, 1), and errors that grow with the distance."""
+    generator = torch.Generator().manual_seed(seed)
+    distance = torch.rand(count, generator=generator)
+    features = torch.zeros(count, 32)
+    features[:, 0], features[:, -1] = distance, 1.0
+    noise = torch.randn(2, count, generator=generator).abs()
+    return features, (distance + 0.1) * noise[0], 20 * (distance + 0.1) * noise[1]
+
+
+@pytest.fixture
+def calibrated() -> ErrorRadius:
+    radius = ErrorRadius((32,))
+    radius.set_training(torch.eye(32)[-1:] + 1e-3 * torch.eye(32)[:10])
+    radius.add_errors(*draw_frames(300, seed=1))
+    radius.calibrate(radius.take_scores())
+    return radius
+
+
+def test_nine_of_ten_errors_are_within_and_far_images_have_larger_radii(calibrated: ErrorRadius) -> None:
+    features, position, orientation = draw_frames(2000, seed=2)
+    radius, radius_deg = calibrated.find_radii(features)
+    for error, found in ((position, radius), (orientation, radius_deg)):
+        assert 0.86 < float((error <= found).float().mean()) < 0.94
+    order = features[:, 0].argsort()
+    assert radius[order[-200:]].mean() > 1.5 * radius[order[:200]].mean()
+
+
+def test_it_is_unknown_before_and_from_few_frames() -> None:
+    radius = ErrorRadius((32,))
+    assert radius.find_radii(torch.zeros(3, 32))[0].isnan().all()
+    radius.set_training(torch.eye(32))
+    radius.add_errors(*draw_frames(5, seed=1))
+    radius.calibrate(radius.take_scores())
+    assert radius.find_radii(torch.zeros(3, 32))[1].isnan().all()
+
+
+@pytest.mark.parametrize("shape", [(32,), (20, 64), (16, 7, 7), (3, 24, 24)])
+def test_it_measures_any_layout(shape: tuple[int, ...]) -> None:
+    radius = ErrorRadius(shape)
+    features = torch.rand(12, *shape, generator=torch.Generator().manual_seed(0))
+    radius.set_training(features[:8])
+    distance = radius.measure_distance(features)
+    assert distance.shape == (12,)
+    assert distance[:8].max() < 1e-3 < distance[8:].min()
+
+
+def test_a_checkpoint_carries_it_and_an_older_one_leaves_it_unknown(calibrated: ErrorRadius) -> None:
+    features = draw_frames(4, seed=3)[0]
+    other = ErrorRadius((32,))
+    other.load_state_dict(calibrated.state_dict())
+    torch.testing.assert_close(other.find_radii(features), calibrated.find_radii(features))
+    model = LinearPoseNet(input_shape=[32])
+    older = {name: value for name, value in model.state_dict().items() if not name.startswith("radius.")}
+    model.on_load_checkpoint({"state_dict": older})
+    model.load_state_dict(older)
+    assert model.locate_images(features, [(64, 48)] * 4).radius_m.shape == (4,)
