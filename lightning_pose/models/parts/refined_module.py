@@ -106,7 +106,9 @@ class RefinedModule(CheckpointHooks):
         if self.radius is not None and not self.trainer.sanity_checking:
             scores = self.radius.take_scores()
             if self.trainer.world_size > 1:
-                scores = self.all_gather(scores).flatten(0, -2)
+                gathered = self.all_gather(scores)
+                assert isinstance(gathered, Tensor)
+                scores = gathered.flatten(0, -2)
             if self.trainer.state.fn == "fit":  # other validation frames may be known to the regressor
                 self.radius.calibrate(scores)
 
