@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import torch
 from torch import Tensor
@@ -106,9 +106,7 @@ class RefinedModule(CheckpointHooks):
         if self.radius is not None and not self.trainer.sanity_checking:
             scores = self.radius.take_scores()
             if self.trainer.world_size > 1:
-                gathered = self.all_gather(scores)
-                assert isinstance(gathered, Tensor)
-                scores = gathered.flatten(0, -2)
+                scores = cast(Tensor, self.all_gather(scores)).flatten(0, -2)
             if self.trainer.state.fn == "fit":  # other validation frames may be known to the regressor
                 self.radius.calibrate(scores)
 
