@@ -48,8 +48,8 @@ class FeatureCache:
     """An extractor's records on disk, one safetensors file per image, found by the image's content.
 
     A file is keyed by the bytes of its image, the version of their decoding, and the extractor's name, version and
-    settings: `<root>/<name>-<settings>/<ab>/<content>.safetensors`; `settings.json` has the settings in full. A moved or
-    renamed dataset is therefore still cached, and different settings have different folders. A process that is
+    settings: `<root>/<name>-<settings>/<ab>/<content>.safetensors`; `settings.json` has the settings in full. A moved
+    or renamed dataset is therefore still cached, and different settings have different folders. A process that is
     killed leaves no partial file; each file has a checksum, and a damaged file is written anew. Several processes may
     fill one cache at the same time and share the work.
 

@@ -41,7 +41,7 @@ def interpolate_poses(
     times, first = np.unique(times_s[usable], return_index=True)
     if not len(times):
         return position, quat
-    positions, turns = positions_m[usable][first], Rotation.from_quat(quats_wxyz[usable][first], scalar_first=True)
+    positions, quats = positions_m[usable][first], quats_wxyz[usable][first]
     after = np.searchsorted(times, at_s).clip(
         max=len(times) - 1
     )  # of two poses around a time; both, where one is at it

@@ -17,12 +17,13 @@ from tests.data.helpers import write_seven_scenes
 
 @pytest.fixture
 def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Two training sequences and a test sequence of 10 frames, each frame another image of 32x24."""
+    """Two training sequences and a test sequence of 10 frames, each frame another image of 80x60."""
     monkeypatch.setenv("COLUMNS", "300")
     write_seven_scenes(tmp_path, train={1: 10, 2: 10}, test={3: 10})
     rng = np.random.default_rng(0)
     for path in sorted(tmp_path.glob("seq-*/*.png")):
-        cv2.imwrite(str(path), rng.integers(0, 255, (24, 32, 3), np.uint8))
+        noise = cv2.resize(rng.integers(0, 255, (15, 20, 3), np.uint8), (80, 60), interpolation=cv2.INTER_CUBIC)
+        cv2.imwrite(str(path), noise)
     return tmp_path
 
 
@@ -44,7 +45,7 @@ def test_sound_dataset(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
         "30 frames",
         "7scenes, ground truth original",
         "train 18, val 2, test 10",
-        "32x24",
+        "80x60",
         "9.00 x 2.00 x 0.00 m",
         "median 1 m, 0 deg",  # the spacing, and the test's distance from the sequence beside it
         "up to 2 m",  # validation took the frames beside the first two

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lightning_pose.errors import ConfigError, DataError
+from lightning_pose.errors import DataError
 from lightning_pose.scenes.formats import load_scene
 from lightning_pose.scenes.formats.tum import pair_by_time
 from lightning_pose.scenes.scene import Intrinsics
