@@ -42,9 +42,8 @@ def interpolate_poses(
     if not len(times):
         return position, quat
     positions, quats = positions_m[usable][first], quats_wxyz[usable][first]
-    after = np.searchsorted(times, at_s).clip(
-        max=len(times) - 1
-    )  # of two poses around a time; both, where one is at it
+    # The two poses around a time, which are one and the same where a pose has that time.
+    after = np.searchsorted(times, at_s).clip(max=len(times) - 1)
     before = np.where(times[after] == at_s, after, np.maximum(after - 1, 0))
     inside = (times[before] <= at_s) & (at_s <= times[after]) & (times[after] - times[before] <= max_gap_s)
     before, after, at_s = before[inside], after[inside], at_s[inside]
@@ -52,8 +51,7 @@ def interpolate_poses(
     part = np.divide(at_s - times[before], step_s, out=np.zeros(len(at_s)), where=step_s > 0)[:, None]
     position[inside] = positions[before] + part * (positions[after] - positions[before])
     if len(before):
-        rotation = (turns[before].inv() * turns[after]).as_rotvec()
-        quat[inside] = (turns[before] * Rotation.from_rotvec(part * rotation)).as_quat(
-            canonical=True, scalar_first=True
-        )
+        start, end = (Rotation.from_quat(quats[rows], scalar_first=True) for rows in (before, after))
+        turn = Rotation.from_rotvec(part * (start.inv() * end).as_rotvec())
+        quat[inside] = (start * turn).as_quat(canonical=True, scalar_first=True)
     return position, quat

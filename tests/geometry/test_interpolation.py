@@ -11,7 +11,11 @@ from lightning_pose.geometry.interpolation import interpolate_poses
 def make_trajectory(poses: int = 12) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     rng = np.random.default_rng(0)
     times = 1.6e9 + np.cumsum(rng.uniform(0.01, 0.2, poses))
-    return times, rng.normal(size=(poses, 3)), Rotation.random(poses, rng=1).as_quat(scalar_first=True)
+    return (
+        times,
+        rng.normal(size=(poses, 3)),
+        Rotation.random(poses, rng=np.random.default_rng(1)).as_quat(scalar_first=True),
+    )
 
 
 def angle_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
