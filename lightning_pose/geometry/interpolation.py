@@ -42,7 +42,7 @@ def interpolate_poses(
     if not len(times):
         return position, quat
     positions, quats = positions_m[usable][first], quats_wxyz[usable][first]
-    # the two poses around each time: one and the same where the time is that of a pose
+    # The two poses around a time, which are one and the same where a pose has that time.
     after = np.searchsorted(times, at_s).clip(max=len(times) - 1)
     before = np.where(times[after] == at_s, after, np.maximum(after - 1, 0))
     inside = (times[before] <= at_s) & (at_s <= times[after]) & (times[after] - times[before] <= max_gap_s)
@@ -52,6 +52,6 @@ def interpolate_poses(
     position[inside] = positions[before] + part * (positions[after] - positions[before])
     if len(before):
         start, end = (Rotation.from_quat(quats[rows], scalar_first=True) for rows in (before, after))
-        turned = start * Rotation.from_rotvec(part * (start.inv() * end).as_rotvec())
-        quat[inside] = turned.as_quat(canonical=True, scalar_first=True)
+        turn = Rotation.from_rotvec(part * (start.inv() * end).as_rotvec())
+        quat[inside] = (start * turn).as_quat(canonical=True, scalar_first=True)
     return position, quat

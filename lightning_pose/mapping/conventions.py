@@ -60,13 +60,16 @@ class Reading:
     focal_px: float
 
 
-def read_poses_as(name: str, rotation: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def read_poses_as(
+    name: str, rotation: np.ndarray, position: np.ndarray, inverse_quats: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
     """The poses that the same files hold under another convention.
 
     Args:
         name: of a `Reading`.
         rotation: (F, 3, 3), camera-to-world rotations as read.
         position: (F, 3), camera centres as read.
+        inverse_quats: whether the files' quaternions are world-to-camera, and were inverted when they were read.
 
     Returns:
         rotation (F, 3, 3) and position (F, 3), camera-to-world, OpenCV axes.
@@ -76,8 +79,10 @@ def read_poses_as(name: str, rotation: np.ndarray, position: np.ndarray) -> tupl
     """
     order, form, axes = dict(_name_readings())[name]
     if shift := QUAT_SHIFTS[order]:
-        quats = np.roll(Rotation.from_matrix(rotation).as_quat(scalar_first=True), shift, axis=1)
-        rotation = Rotation.from_quat(quats, scalar_first=True).as_matrix()
+        filed = np.swapaxes(rotation, -1, -2) if inverse_quats else rotation
+        quats = np.roll(Rotation.from_matrix(filed).as_quat(scalar_first=True), shift, axis=1)
+        filed = Rotation.from_quat(quats, scalar_first=True).as_matrix()
+        rotation = np.swapaxes(filed, -1, -2) if inverse_quats else filed
     if form:
         rotation = np.swapaxes(rotation, -1, -2)
     if form == "world-to-camera":
@@ -89,7 +94,9 @@ def read_poses_as(name: str, rotation: np.ndarray, position: np.ndarray) -> tupl
     return rotation @ turn, position
 
 
-def rank_readings(matches: FrameMatches, rotation: np.ndarray, position: np.ndarray, width_px: float) -> list[Reading]:
+def rank_readings(
+    matches: FrameMatches, rotation: np.ndarray, position: np.ndarray, width_px: float, inverse_quats: bool = False
+) -> list[Reading]:
     """Every usual reading of the poses, best first; the files' own comes before others of equal cost.
 
     Every reading gets the focal length that suits it best, so that none needs the camera to be known.
@@ -99,13 +106,16 @@ def rank_readings(matches: FrameMatches, rotation: np.ndarray, position: np.ndar
         rotation: (F, 3, 3), camera-to-world rotations as read.
         position: (F, 3), camera centres as read.
         width_px: the longer side of the images.
+        inverse_quats: see `read_poses_as`.
 
     Returns:
         one `Reading` for each name; all costs are nan where no pair of frames has a baseline.
     """
 
     def measure(name: str, matches: FrameMatches, rounds: int) -> Reading:
-        return Reading(name, *fit_focal_length(matches, *read_poses_as(name, rotation, position), width_px, rounds))
+        return Reading(
+            name, *fit_focal_length(matches, *read_poses_as(name, rotation, position, inverse_quats), width_px, rounds)
+        )
 
     few = matches.sample(MATCHES_TO_RANK)
     coarse = sorted((measure(name, few, rounds=1) for name, _ in _name_readings()), key=lambda reading: reading.cost)

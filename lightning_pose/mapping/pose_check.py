@@ -35,8 +35,11 @@ FITS = 0.004
 FOCAL_TOLERANCE = 0.1
 """A known focal length farther than this share from the fitted one is reported."""
 
-PLAUSIBLE_DEPTH_M = (0.05, 300.0)
+PLAUSIBLE_DEPTH_M = (0.05, 150.0)
 """Median distance of what the cameras see, where positions are in metres."""
+
+WORLD_TO_CAMERA_FORMATS = ("cambridge", "colmap")
+"""Formats whose files hold world-to-camera quaternions, so that a wrong order is one of those."""
 
 CLEARER = 0.9
 """Poses of another time are proposed if their cost and their residual are below this share of those as given."""
@@ -113,7 +116,9 @@ def check_poses(scene: Scene) -> PoseCheck:
     if moved.sum() < MIN_PAIRS:
         found.facts["poses and images"] = f"not compared: only {moved.sum()} pairs of frames match and move"
         return found
-    found.readings = rank_readings(matches, rotation, position, max(sizes[0]) * scales[0])
+    found.readings = rank_readings(
+        matches, rotation, position, max(sizes[0]) * scales[0], scene.format in WORLD_TO_CAMERA_FORMATS
+    )
     _judge_readings(found, scales[0], len(matches.pair), FITS * max(sizes[0]) * scales[0])
     _judge_focal_length(found, scene, sizes[0])
     _judge_clock(found, scene, matches, scales[0], FITS * max(sizes[0]) * scales[0])
@@ -218,7 +223,7 @@ def _judge_depth(
     found.facts["distance of what is seen"] = f"median {median:.3g} {scene.unit}"
     low, high = PLAUSIBLE_DEPTH_M
     if scene.unit == "m" and not low <= median <= high:
-        unit = "millimetres" if median > high else "kilometres, or scaled"
+        unit = "millimetres or centimetres" if median > high else "kilometres, or scaled"
         found.warnings.append(
             f"the cameras see things at {median:.3g} m (median), which is implausible; if the positions are in "
             f"{unit}, convert them to metres, or errors in metres mean nothing"

@@ -207,14 +207,30 @@ def _decode_pixels(data: bytes, path: Path | str) -> tuple[np.ndarray, int]:
     except cv2.error:
         image, kinds, metadata = None, [], []
     if image is None or not image.size:
-        raise ImageError(
-            f"{path} is truncated or is not an image that OpenCV reads ({len(data)} bytes); "
-            "copy it again, or convert it to PNG or JPEG"
-        )
+        raise ImageError(f"{path} {_describe_undecodable(data)}")
     if image.dtype not in (np.uint8, np.uint16):
         raise ImageError(f"{path} holds {image.dtype} pixels; convert it to 8 or 16 bits a channel")
     exif = [np.asarray(block).tobytes() for kind, block in zip(kinds, metadata, strict=True) if kind == EXIF]
     return image, _parse_orientation(exif[0]) if exif else 1
+
+
+def _describe_undecodable(data: bytes) -> str:
+    """What the bytes of a file are that OpenCV does not decode, and what to do about it."""
+    start = data[:200].lstrip().lower()
+    if start.startswith(b"version https://git-lfs"):
+        return "is a Git LFS pointer, not the image; run `git lfs pull` in the dataset's repository"
+    if data[4:8] == b"ftyp" and data[8:12] in (b"heic", b"heix", b"mif1", b"msf1", b"hevc"):
+        return "is a HEIC photo, whatever its name says; convert it to JPEG"
+    if start.startswith((b"<!doctype", b"<html")):
+        return "is a web page, not an image; download it again"
+    try:
+        raw = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        raw = None
+    if raw is not None:
+        return f"holds {raw.dtype} pixels; convert it to 8 or 16 bits a channel"
+    size = f"({len(data)} bytes)"
+    return f"is truncated or is not an image that OpenCV reads {size}; copy it again, or convert it to PNG or JPEG"
 
 
 def _parse_orientation(exif: bytes) -> int:

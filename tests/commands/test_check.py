@@ -17,12 +17,13 @@ from tests.data.helpers import write_seven_scenes
 
 @pytest.fixture
 def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Two training sequences and a test sequence of 10 frames, each frame another image of 32x24."""
+    """Two training sequences and a test sequence of 10 frames, each frame another image of 160x120."""
     monkeypatch.setenv("COLUMNS", "300")
     write_seven_scenes(tmp_path, train={1: 10, 2: 10}, test={3: 10})
     rng = np.random.default_rng(0)
     for path in sorted(tmp_path.glob("seq-*/*.png")):
-        cv2.imwrite(str(path), rng.integers(0, 255, (24, 32, 3), np.uint8))
+        noise = cv2.resize(rng.integers(0, 255, (30, 40, 3), np.uint8), (160, 120), interpolation=cv2.INTER_CUBIC)
+        cv2.imwrite(str(path), noise)
     return tmp_path
 
 
@@ -44,7 +45,7 @@ def test_sound_dataset(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
         "30 frames",
         "7scenes, ground truth original",
         "train 18, val 2, test 10",
-        "32x24",
+        "160x120",
         "9.00 x 2.00 x 0.00 m",
         "median 1 m, 0 deg",  # the spacing, and the test's distance from the sequence beside it
         "up to 2 m",  # validation took the frames beside the first two
@@ -77,7 +78,7 @@ def test_copies_are_warned_of_above_all_across_the_split(root: Path, capsys: pyt
 def test_mixed_sizes_are_warned_of(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cv2.imwrite(str(image(root, 1, 0)), np.zeros((10, 12, 3), np.uint8))
     assert main([str(root)]) == 0
-    assert "warning: images of 2 sizes, 32x24 (29), 12x10 (1); resize them" in capsys.readouterr().out
+    assert "warning: images of 2 sizes, 160x120 (29), 12x10 (1); resize them" in capsys.readouterr().out
 
 
 def test_jump_is_warned_of(root: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -61,6 +61,15 @@ def test_another_convention_is_an_error_that_names_it(
     assert "convert the pose files" in error
 
 
+def test_another_order_of_world_to_camera_quaternions_is_named(room: Scene) -> None:
+    def misread(rotation: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        filed = Rotation.from_matrix(rotation.T).as_quat()  # x, y, z, w, read as w, x, y, z
+        return Rotation.from_quat(filed, scalar_first=True).as_matrix().T, position
+
+    (error,) = check_poses(replace(rewrite(room, misread), format="cambridge")).errors
+    assert "if the files hold: quaternion order xyzw (0." in error
+
+
 def test_millimetres_are_a_warning(room: Scene) -> None:
     found = check_poses(rewrite(room, lambda R, c: (R, 1000 * c)))
     (warning,) = found.warnings

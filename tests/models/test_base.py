@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from itertools import pairwise
 
@@ -165,3 +166,15 @@ def test_frames_without_features_are_counted_or_refused(caplog: pytest.LogCaptur
     data.features[:20] = 0
     with pytest.raises(DataError, match=r"20 of 24 training frames have no features.*check"):
         check_features(data)
+
+
+def test_frames_with_fewer_features_than_asked_for_are_counted(caplog: pytest.LogCaptureFixture) -> None:
+    features = torch.ones(4, 5, 2)
+    features[1, 3:] = 0
+    features[2, 1:] = 0
+    data = PoseBatch(features, torch.zeros(4, 3), torch.zeros(4, 4), torch.arange(4))
+    with caplog.at_level(logging.WARNING, "lightning_pose"):
+        check_features(data)
+        assert caplog.text == ""
+        check_features(data, local=True)
+    assert "2 of 4 training frames have fewer than 5 features (median 1, least 1)" in caplog.text

@@ -232,3 +232,18 @@ def test_file_and_pixels_give_the_same_gray(suffix: str, tmp_path: Path) -> None
 def test_to_gray_refuses(image: np.ndarray, message: str) -> None:
     with pytest.raises(ImageError, match=message):
         to_gray(image)
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "is a Git LFS pointer"),
+        (b"\x00\x00\x00\x18ftypheic\x00\x00\x00\x00mif1heic", "is a HEIC photo"),
+        (b"<!DOCTYPE html><html>", "is a web page"),
+        (cv2.imencode(".tiff", np.zeros((8, 9), np.float32))[1].tobytes(), "holds float32 pixels"),
+        (b"garbage", "is truncated or is not an image"),
+    ],
+)
+def test_what_is_no_image_is_said(data: bytes, message: str) -> None:
+    with pytest.raises(ImageError, match=message):
+        decode_image(data, "a.jpg", color=False)
