@@ -16,12 +16,11 @@ from lightning_pose.geometry.camera import Camera
 from lightning_pose.geometry.relative import RelativeFrame
 from lightning_pose.localization.inputs import read_images
 from lightning_pose.localization.sequences import locate_sequence
-from lightning_pose.models.parts.answers import Answers, answer_by_network
-from lightning_pose.models.parts.poses import Pose
 from lightning_pose.scenes.images import to_gray
 
 if TYPE_CHECKING:
     from lightning_pose.models import PoseModule
+    from lightning_pose.models.parts.answers import Answers
 
 __all__ = ["Localizer"]
 
@@ -99,6 +98,9 @@ class Localizer:
         camera: str | Camera | None = None,
     ) -> Answers:
         """As a call, and say of each pose what it comes from, and how sure it is."""
+        from lightning_pose.models.parts.answers import answer_by_network  # Lightning, which takes seconds to import
+        from lightning_pose.models.parts.poses import Pose
+
         camera = Camera.parse(camera) if isinstance(camera, str) else camera
         extractor, arrays = self.extractor, read_images(images, self.extractor)
         if not arrays:

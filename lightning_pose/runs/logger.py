@@ -38,6 +38,7 @@ REQUIREMENTS = (
     "lightning",
     "numpy",
     "opencv-contrib-python-headless",
+    "pillow",
     "platformdirs",
     "rich",
     "safetensors",

@@ -19,7 +19,7 @@ from lightning_pose.runs.logger import REQUIREMENTS, MLflowLogger, find_last_run
 from lightning_pose.runs.process import has_died, identify_machine, process_name
 from tests.helpers import Trained, Workplace
 
-DISTRIBUTIONS = {"cv2": "opencv-contrib-python-headless", "yaml": "PyYAML", "sklearn": "scikit-learn"}
+DISTRIBUTIONS = {"PIL": "pillow", "cv2": "opencv-contrib-python-headless", "yaml": "PyYAML", "sklearn": "scikit-learn"}
 """Where a distribution's name is not that of its package."""
 
 LIGHTNING_BRINGS = {"torchmetrics"}
