@@ -17,6 +17,7 @@ from lightning_pose.geometry.relative import RelativeFrame, check_relative_frame
 from lightning_pose.scenes.formats import OnBadFrame
 from lightning_pose.scenes.gaps import describe_gaps
 from lightning_pose.scenes.ground_truth import GroundTruth
+from lightning_pose.scenes.pose_times import ClockOffsetSetting, PoseTime
 from lightning_pose.scenes.scene import Scene
 
 __all__ = ["ClipDataModule", "require_clips"]
@@ -46,6 +47,10 @@ class ClipDataModule(SceneDataModule):
         pgt: folder of the pseudo ground truth of Brachmann et al. (ICCV 2021), which holds sfm/7scenes/SCENE_train.txt.
         camera: of all images, as `MODEL,WIDTH,HEIGHT,PARAMETERS...` in COLMAP's notation, with the centre of the first
             pixel at (0, 0); such as PINHOLE,640,480,525,525,319.5,239.5. That of the dataset if not given.
+        pose_time: which pose an image has, where the dataset has poses by time (TUM RGB-D): the `nearest`, as is usual,
+            or `interpolate`d at the image's own time.
+        clock_offset_ms: with `interpolate`, milliseconds from an image's time to its pose's; `auto` finds those under
+            which the training frames fit best. Errors are then under another ground truth, which is named so.
         clip_length: T, 2 to 400.
         stride: from one frame of a clip to the next.
         hop: from the first frame of a clip to that of the next; by default clips share one frame, so that they chain.
@@ -87,6 +92,8 @@ class ClipDataModule(SceneDataModule):
         ground_truth: GroundTruth = "original",
         pgt: str | None = None,
         camera: str | None = None,
+        pose_time: PoseTime = "nearest",
+        clock_offset_ms: ClockOffsetSetting = 0.0,
         clip_length: int = 10,
         stride: int = 1,
         hop: int | None = None,
@@ -122,6 +129,8 @@ class ClipDataModule(SceneDataModule):
             on_bad_frame,
             split,
             camera,
+            pose_time,
+            clock_offset_ms,
         )
         self.root = root
         self.train_scenes = train_scenes
@@ -131,6 +140,8 @@ class ClipDataModule(SceneDataModule):
         self.ground_truth: GroundTruth = ground_truth
         self.pgt = pgt
         self.camera = camera
+        self.pose_time: PoseTime = pose_time
+        self.clock_offset_ms: ClockOffsetSetting = clock_offset_ms
         self.clip_length = clip_length
         self.stride = stride
         self.hop = hop

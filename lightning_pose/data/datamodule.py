@@ -23,6 +23,7 @@ from lightning_pose.geometry.camera import Camera
 from lightning_pose.paths import cache_folder
 from lightning_pose.scenes.cameras import make_camera
 from lightning_pose.scenes.images import read_image_size
+from lightning_pose.scenes.pose_times import ClockOffsetSetting, interpolate_scene
 from lightning_pose.scenes.scene import Scene
 from lightning_pose.scenes.synthetic import RENDERER_VERSION, render_room
 
@@ -53,6 +54,9 @@ class SceneDataModule(LightningDataModule):
         ConfigError: a number is out of its range.
         DataError: the scene cannot be read, or a split that is needed is empty.
     """
+
+    clock_offset_ms: ClockOffsetSetting = 0.0
+    """From the images' times to those of their poses, for subclasses that have such a setting."""
 
     gives_clips: ClassVar[bool] = False
     """Whether an item is a clip (T, ...) of consecutive frames, with poses relative to its first frame."""
@@ -93,6 +97,11 @@ class SceneDataModule(LightningDataModule):
         """The scene, read (or rendered) on first use."""
         if self._scene is None:
             self._scene = self._load_scene()
+            if self.clock_offset_ms == "auto":
+                from lightning_pose.data.clock import find_clock_offset_ms  # it needs this class
+
+                self._scene = interpolate_scene(self._scene, find_clock_offset_ms(self))
+                self._cameras = {}  # numbers of frames may have changed
         return self._scene
 
     def replace_split(self, split: str, indices: np.ndarray) -> None:

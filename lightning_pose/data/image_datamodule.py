@@ -13,6 +13,7 @@ from lightning_pose.errors import ConfigError
 from lightning_pose.features import FeatureCache, FeatureExtractor, LocalExtractor
 from lightning_pose.scenes.formats import OnBadFrame
 from lightning_pose.scenes.ground_truth import GroundTruth
+from lightning_pose.scenes.pose_times import ClockOffsetSetting, PoseTime
 from lightning_pose.scenes.scene import Scene
 
 __all__ = ["ImageDataModule"]
@@ -37,6 +38,10 @@ class ImageDataModule(SceneDataModule):
         pgt: folder of the pseudo ground truth of Brachmann et al. (ICCV 2021), which holds sfm/7scenes/SCENE_train.txt.
         camera: of all images, as `MODEL,WIDTH,HEIGHT,PARAMETERS...` in COLMAP's notation, with the centre of the first
             pixel at (0, 0); such as PINHOLE,640,480,525,525,319.5,239.5. That of the dataset if not given.
+        pose_time: which pose an image has, where the dataset has poses by time (TUM RGB-D): the `nearest`, as is usual,
+            or `interpolate`d at the image's own time.
+        clock_offset_ms: with `interpolate`, milliseconds from an image's time to its pose's; `auto` finds those under
+            which the training frames fit best. Errors are then under another ground truth, which is named so.
         val_fraction: part of the training split kept for validation, in whole blocks of the trajectory; 0 for none.
         batch_size: frames in a training batch.
         eval_batch_size: frames in a batch where no gradient is needed.
@@ -68,6 +73,8 @@ class ImageDataModule(SceneDataModule):
         ground_truth: GroundTruth = "original",
         pgt: str | None = None,
         camera: str | None = None,
+        pose_time: PoseTime = "nearest",
+        clock_offset_ms: ClockOffsetSetting = 0.0,
         val_fraction: float = 0.1,
         batch_size: int = 64,
         eval_batch_size: int = 256,
@@ -92,6 +99,8 @@ class ImageDataModule(SceneDataModule):
             on_bad_frame,
             split,
             camera,
+            pose_time,
+            clock_offset_ms,
         )
         self.root = root
         self.train_scenes = train_scenes
@@ -101,6 +110,8 @@ class ImageDataModule(SceneDataModule):
         self.ground_truth: GroundTruth = ground_truth
         self.pgt = pgt
         self.camera = camera
+        self.pose_time: PoseTime = pose_time
+        self.clock_offset_ms: ClockOffsetSetting = clock_offset_ms
         self.val_fraction = val_fraction
         self.feature_pool = feature_pool
         self._pool = None if feature_pool is None else _widen_extractor(extractor, feature_pool)

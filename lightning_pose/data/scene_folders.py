@@ -13,6 +13,7 @@ from lightning_pose.scenes.combine import check_one_world, join_scenes
 from lightning_pose.scenes.formats import OnBadFrame, load_scene
 from lightning_pose.scenes.formats.split_rules import check_split_rule
 from lightning_pose.scenes.ground_truth import GroundTruth, apply_ground_truth, check_ground_truth
+from lightning_pose.scenes.pose_times import ClockOffsetSetting, PoseTime, check_pose_time, interpolate_scene
 from lightning_pose.scenes.scene import Scene
 
 __all__ = ["SceneFolders"]
@@ -37,6 +38,8 @@ class SceneFolders:
         on_bad_frame: as for `load_scene`.
         split: likewise.
         camera: of all frames, in COLMAP's notation; each format's own if None.
+        pose_time: `interpolate` poses at the images' times.
+        clock_offset_ms: then added to the images' times; `auto` is 0 here, and found later.
 
     Raises:
         ConfigError: scenes are named in two ways, none to train on is named, or settings contradict each other.
@@ -53,9 +56,12 @@ class SceneFolders:
     on_bad_frame: OnBadFrame = "refuse"
     split: str | None = None
     camera: str | None = None
+    pose_time: PoseTime = "nearest"
+    clock_offset_ms: ClockOffsetSetting = 0.0
 
     def __post_init__(self) -> None:
         check_ground_truth(self.ground_truth, self.pgt)
+        check_pose_time(self.pose_time, self.clock_offset_ms)
         if self.split is not None:
             check_split_rule(self.split)
         if self.camera is not None:
@@ -110,6 +116,8 @@ class SceneFolders:
         test_fraction = TEST_FRACTION if tested else 0.0
         scene = load_scene(folder, self.format, val_fraction, test_fraction, val_block, self.on_bad_frame, self.split)
         scene = apply_ground_truth(scene, self.ground_truth, self.pgt)
+        if self.pose_time == "interpolate":
+            scene = interpolate_scene(scene, 0.0 if self.clock_offset_ms == "auto" else self.clock_offset_ms)
         return scene if self.camera is None else apply_camera(scene, Camera.parse(self.camera))
 
 

@@ -11,6 +11,7 @@ from lightning_pose.geometry.epipolar import essential_matrices, sampson_distanc
 from lightning_pose.geometry.interpolation import interpolate_poses
 from lightning_pose.mapping.conventions import OUTLIER_PX
 from lightning_pose.mapping.frame_matches import FrameMatches
+from lightning_pose.scenes.pose_times import measure_hole
 from lightning_pose.scenes.scene import Trajectory
 
 __all__ = ["MAX_OFFSET_S", "STEP_S", "ClockOffset", "fit_clock_offset"]
@@ -18,9 +19,6 @@ __all__ = ["MAX_OFFSET_S", "STEP_S", "ClockOffset", "fit_clock_offset"]
 MAX_OFFSET_S = 0.2
 STEP_S = 0.01
 """Offsets that are tried first; then the best one's surroundings in steps of a tenth."""
-
-HOLE = 3.5
-"""Poses this many usual steps apart have a hole between them, in which none are interpolated."""
 
 MIN_PAIRS = 10
 
@@ -67,10 +65,9 @@ def fit_clock_offset(
     Returns:
         None where fewer than `MIN_PAIRS` pairs have poses at every offset.
     """
-    different = np.unique(trajectory.times_s)
-    if len(different) < 2:
+    gap_s = measure_hole(trajectory)
+    if gap_s == 0:
         return None
-    gap_s = HOLE * float(np.median(np.diff(different)))
 
     def read_poses(offset_s: float) -> tuple[np.ndarray, np.ndarray]:
         position, quat = interpolate_poses(*trajectory, times_s + offset_s, gap_s)

@@ -15,7 +15,7 @@ from lightning_pose.scenes.formats.base import SceneFormat, keep_usable
 from lightning_pose.scenes.formats.image_files import ImageFinder
 from lightning_pose.scenes.formats.poses import check_quats
 from lightning_pose.scenes.formats.text_files import read_lines, read_table, read_text
-from lightning_pose.scenes.scene import Frame, Intrinsics, Scene
+from lightning_pose.scenes.scene import Frame, Intrinsics, Scene, Trajectory
 
 __all__ = ["FORMAT", "Euroc"]
 
@@ -61,26 +61,29 @@ class Euroc(SceneFormat):
             raise DataError(f"{truth} holds no usable pose; its columns are `{COLUMNS}`, restore the original")
         start = times_ns[0]
         pose_s = (table.values[sound, 0] - start) / 1e9
-        body_m, body_quats = interpolate_poses(
-            pose_s, position_m[sound], quats[sound], (times_ns - start) / 1e9, MAX_GAP_S
-        )  # fmt: skip
-        posed = np.flatnonzero(np.isfinite(body_m[:, 0]))
+        turns = Rotation.from_quat(quats[sound], scalar_first=True)
+        trajectory = Trajectory(
+            table.values[sound, 0] / 1e9,
+            position_m[sound] + turns.apply(T_body_cam[:3, 3]),
+            (turns * Rotation.from_matrix(T_body_cam[:3, :3])).as_quat(canonical=True, scalar_first=True),
+        )
+        centres, cam_quats = interpolate_poses(
+            pose_s, trajectory.positions_m, trajectory.quats_wxyz, (times_ns - start) / 1e9, MAX_GAP_S
+        )
+        posed = np.flatnonzero(np.isfinite(centres[:, 0]))
         if not len(posed):
             raise DataError(f"{folder}: no image lies within the times of {truth}; bring both to one clock")
         if len(posed) < len(images):
             log.warning(
                 "%s: dropped %d of %d images, no pose at their time", root, len(images) - len(posed), len(images)
             )
-        turns = Rotation.from_quat(body_quats[posed], scalar_first=True)
-        centres = body_m[posed] + turns.apply(T_body_cam[:3, 3])
-        cam_quats = (turns * Rotation.from_matrix(T_body_cam[:3, :3])).as_quat(canonical=True, scalar_first=True)
         name = folder.resolve().parent.name if folder.resolve().name == "mav0" else root.resolve().name
         frames = [
-            Frame(images[i], centres[row], cam_quats[row], name, int(i), float(times_ns[i] / 1e9), intrinsics)
-            for row, i in enumerate(posed)
+            Frame(images[i], centres[i], cam_quats[i], name, int(i), float(times_ns[i] / 1e9), intrinsics)
+            for i in posed
         ]
         usable, bad = keep_usable(frames, [""] * len(frames), "cam0/data.csv")
-        return Scene(name, root, self.name, usable, bad_frames=bad)
+        return Scene(name, root, self.name, usable, bad_frames=bad, trajectory=trajectory)
 
 
 FORMAT = Euroc()
