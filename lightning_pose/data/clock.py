@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from lightning.pytorch.utilities.rank_zero import rank_zero_only
+from lightning.fabric.utilities.rank_zero import rank_zero_only
 from scipy.spatial.transform import Rotation
 
 from lightning_pose.data.datamodule import SceneDataModule

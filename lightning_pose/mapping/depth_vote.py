@@ -6,7 +6,6 @@ import itertools
 
 import numpy as np
 
-from lightning_pose.geometry.triangulation import find_two_view_depths
 from lightning_pose.mapping.frames import MapFrames
 from lightning_pose.mapping.guided_matching import KeypointMatches
 
@@ -37,59 +36,97 @@ def vote_depths(frames: MapFrames, matches: KeypointMatches, agree_px: float = A
     Returns:
         (M,) bool.
     """
-    rows = np.concatenate([np.arange(len(matches.distance))] * 2)
-    near = np.concatenate([matches.frame[:, 0], matches.frame[:, 1]])
-    far = np.concatenate([matches.frame[:, 1], matches.frame[:, 0]])
-    near_keypoint = np.concatenate([matches.keypoint[:, 0], matches.keypoint[:, 1]])
-    far_keypoint = np.concatenate([matches.keypoint[:, 1], matches.keypoint[:, 0]])
-    order = np.argsort(near * frames.points.shape[1] + near_keypoint, kind="stable")
-    rows, near, far, near_keypoint, far_keypoint = (
-        column[order] for column in (rows, near, far, near_keypoint, far_keypoint)
-    )
-    group = np.cumsum(np.diff(near * frames.points.shape[1] + near_keypoint, prepend=-1) != 0) - 1
-    supports = _find_supporters(frames, group, near, near_keypoint, far, far_keypoint, agree_px)
+    n_keypoints = frames.points.shape[1]
+    ids = (matches.frame * n_keypoints + matches.keypoint).T.ravel()
+    order = np.argsort(ids, kind="stable")
+    group = np.cumsum(np.diff(ids[order], prepend=-1) != 0) - 1
+    far, far_keypoint = matches.frame[:, ::-1].T.ravel()[order], matches.keypoint[:, ::-1].T.ravel()[order]
+    step, start = _find_rays(frames, ids[order] // n_keypoints, ids[order] % n_keypoints, far)
+    observed = frames.points[far, far_keypoint].T
+    depth = _find_depths(step, start, observed)
+    supports = _support_best(group, depth, *_find_depth_ranges(step, start, observed, agree_px / frames.focal_px[far]))
     kept = np.zeros(len(matches.distance), bool)
-    kept[rows[supports]] = True
+    kept[order[supports] % len(kept)] = True
     return kept
 
 
-def _find_supporters(
-    frames: MapFrames,
-    group: np.ndarray,
-    near: np.ndarray,
-    near_keypoint: np.ndarray,
-    far: np.ndarray,
-    far_keypoint: np.ndarray,
-    agree_px: float,
-) -> np.ndarray:
-    """(D,) bool: which of the directed matches, sorted by their near keypoint (`group`), support its best depth."""
-    to_far = np.swapaxes(frames.rotation[far], 1, 2)
-    rotation = to_far @ frames.rotation[near]
-    start = np.einsum("dij,dj->di", to_far, frames.position[near] - frames.position[far])
-    ray = np.column_stack([frames.points[near, near_keypoint], np.ones(len(near))])
-    observed = frames.points[far, far_keypoint]
-    centre = -np.einsum("dji,dj->di", rotation, start)
-    depth = find_two_view_depths(ray[:, :2], observed, np.swapaxes(rotation, 1, 2), centre).astype(np.float32)
-    # At depth z of its ray, the near keypoint lies at z * step + start in the far camera.
-    step, start = np.einsum("dij,dj->di", rotation, ray).astype(np.float32), start.astype(np.float32)
-    observed, gate = observed.astype(np.float32), ((agree_px / frames.focal_px[far]) ** 2).astype(np.float32)
+def _find_rays(
+    frames: MapFrames, near: np.ndarray, keypoint: np.ndarray, far: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The rays of D keypoints in other frames' cameras: at depth z, one lies at z * step + start; both (3, D)."""
+    pair, index = np.unique(near * len(frames) + far, return_inverse=True)
+    one, other = pair // len(frames), pair % len(frames)
+    to_other = np.swapaxes(frames.rotation[other], 1, 2)
+    rotation = to_other @ frames.rotation[one]
+    shift = (to_other @ (frames.position[one] - frames.position[other])[:, :, None])[:, :, 0]
+    x, y = frames.points[near, keypoint].T
+    step = np.stack([r[index, 0] * x + r[index, 1] * y + r[index, 2] for r in np.moveaxis(rotation, 1, 0)])
+    return step, shift.T[:, index]
 
-    def agrees(z: np.ndarray, voter: np.ndarray) -> np.ndarray:
-        local = z[:, None] * step[voter] + start[voter]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            error = local[:, :2] / local[:, 2:] - observed[voter]
-        return ((error**2).sum(axis=1) <= gate[voter]) & (local[:, 2] > 0) & (z > 0)
 
+def _find_depths(step: np.ndarray, start: np.ndarray, observed: np.ndarray) -> np.ndarray:
+    """(D,) depth at which each ray passes nearest to its partner's; negative where they meet behind the camera."""
+    ray = np.stack([*observed, np.ones(observed.shape[1])])
+    aa, bb, ab = ((x * y).sum(axis=0) for x, y in ((step, step), (ray, ray), (step, ray)))
+    at, bt = (step * start).sum(axis=0), (ray * start).sum(axis=0)
+    return (ab * bt - bb * at) / np.maximum(aa * bb - ab**2, 1e-12)
+
+
+def _support_best(group: np.ndarray, depth: np.ndarray, nearest: np.ndarray, farthest: np.ndarray) -> np.ndarray:
+    """(D,) bool: which of the directed matches support the best depth of their near keypoint (`group`, ascending)."""
+    if not len(group):
+        return np.zeros(0, bool)
     size = np.bincount(group)
     first = np.cumsum(size) - size
     votes = np.zeros(len(group), np.int64)
     voters = size[group]  # of each proposer: its whole group
     done = np.cumsum(voters)
-    cuts = np.searchsorted(done, np.arange(0, done[-1] + CHUNK, CHUNK), side="right").tolist() if len(group) else []
-    for low, high in itertools.pairwise(cuts):
+    for low, high in itertools.pairwise(
+        np.searchsorted(done, np.arange(0, done[-1] + CHUNK, CHUNK), side="right").tolist()
+    ):
+        if low == high:
+            continue
         count = voters[low:high]
-        proposer = np.repeat(np.arange(low, high), count)
-        voter = np.arange(len(proposer)) + np.repeat(first[group[low:high]] - np.cumsum(count) + count, count)
-        votes[low:high] = np.bincount(proposer - low, agrees(depth[proposer], voter), high - low)
-    best = np.lexsort((-votes, group))[first]
-    return agrees(depth[best][group], np.arange(len(group))) & (votes[best] >= SUPPORTERS)[group]
+        ends = np.cumsum(count)
+        proposed = np.repeat(depth[low:high], count)
+        voter = np.arange(len(proposed)) + np.repeat(first[group[low:high]] - ends + count, count)
+        agrees = (proposed >= nearest[voter]) & (proposed <= farthest[voter])
+        votes[low:high] = np.add.reduceat(agrees, ends - count, dtype=np.int64)
+    most = np.maximum.reduceat(votes, first)
+    best = np.flatnonzero(votes == most[group])
+    best = best[np.diff(group[best], prepend=-1) != 0]
+    winner = depth[best][group]
+    return (winner >= nearest) & (winner <= farthest) & (most >= SUPPORTERS)[group]
+
+
+def _find_depth_ranges(
+    step: np.ndarray, start: np.ndarray, observed: np.ndarray, radius: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Nearest and farthest depth z at which z * step + start projects to within `radius` of `observed`.
+
+    In front of the camera, a point that moves along a ray moves along a line in the image, and is within a disc from
+    one depth to another, or for ever. The two are the roots of a square equation.
+
+    Args:
+        step: (3, D).
+        start: (3, D).
+        observed: (2, D), normalised image coordinates.
+        radius: (D,).
+
+    Returns:
+        (D,) nearest depth, and (D,) farthest; the nearest is above the farthest where there is none.
+    """
+    moving, fixed, squared = step[:2] - observed * step[2], start[:2] - observed * start[2], radius**2
+    a = (moving**2).sum(axis=0) - squared * step[2] ** 2
+    b = (moving * fixed).sum(axis=0) - squared * step[2] * start[2]
+    c = (fixed**2).sum(axis=0) - squared * start[2] ** 2
+    root = np.sqrt(np.maximum(b**2 - a * c, 0.0))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        one, other = (-b - root) / a, (-b + root) / a
+        low, high = np.minimum(one, other), np.maximum(one, other)
+        passes = (b**2 >= a * c) & (step[2] * (low + high) / 2 + start[2] > 0)
+    # a < 0: the ray ends within the disc; it enters from the side of the camera where depths are positive.
+    away = step[2] > 0
+    nearest = np.where(a > 0, np.where(passes, low, np.inf), np.where(away, high, -np.inf))
+    farthest = np.where(a > 0, np.where(passes, high, -np.inf), np.where(away, np.inf, low))
+    return np.maximum(nearest, np.finfo(float).tiny), farthest

@@ -10,14 +10,15 @@ from torch import Tensor
 
 from lightning_pose.geometry.epipolar import essential_matrices
 from lightning_pose.mapping.frames import MapFrames
+from lightning_pose.mapping.threads import map_in_threads
 
 __all__ = ["KeypointMatches", "match_pairs"]
 
-BAND_PX = 4.0
-"""How far a match may lie from its epipolar line."""
+BAND_PX = 4.5
+"""How far a match of equal sizes may lie from its epipolar line."""
 
-SIZE_RATIO = 2.0
-"""How much larger one keypoint of a match may be than the other."""
+SIZE_RATIO = 2.25
+"""How much larger one keypoint of a match may be than the other, if it lies on the line."""
 
 MAX_DISTANCE = 0.5
 """Largest distance of the two descriptors."""
@@ -25,8 +26,11 @@ MAX_DISTANCE = 0.5
 RATIO = 0.8
 """The best match's distance must be below this times the second best's within the band."""
 
-BATCH = 16
-"""Pairs matched at once."""
+FAR = 1e6
+"""Squared distance of rows that are no keypoints from all others."""
+
+BATCH = 4
+"""Pairs matched at once: as many as fit a processor's cache."""
 
 
 @dataclass(frozen=True)
@@ -64,34 +68,47 @@ def match_pairs(frames: MapFrames, pairs: np.ndarray, band_px: float = BAND_PX) 
     rays = torch.from_numpy(np.concatenate([frames.points, np.ones_like(frames.points[..., :1])], axis=2)).float()
     descriptors = torch.from_numpy(frames.descriptors)
     size = np.maximum(frames.size_px / frames.focal_px[:, None], 1e-9)  # an angle: images may differ in size
-    log_size = torch.from_numpy(np.where(frames.real, np.log2(size), np.inf)).float()
+    octaves = torch.from_numpy(np.log2(size) / np.log2(SIZE_RATIO)).float()
+    padding = torch.from_numpy(np.where(frames.real, 0.0, FAR)).float()
     band = torch.from_numpy(band_px / frames.focal_px).float()
-    found: list[tuple[np.ndarray, ...]] = []
-    for start in range(0, len(pairs), BATCH):
+
+    def match_chunk(start: int) -> tuple[np.ndarray, ...]:
         chunk = slice(start, start + BATCH)
         i, j = torch.from_numpy(a[chunk]), torch.from_numpy(b[chunk])
         lines = rays[i] @ torch.from_numpy(essential[chunk]).float().mT
-        lines = lines / lines[..., :2].norm(dim=-1, keepdim=True).clamp(min=1e-12)
-        offset = torch.bmm(lines, rays[j].mT).abs_()
-        possible = offset <= band[j][:, None, None]
-        possible &= (log_size[i][:, :, None] - log_size[j][:, None, :]).abs_() <= np.log2(SIZE_RATIO)
-        similarity = torch.bmm(descriptors[i], descriptors[j].mT).masked_fill_(~possible, -1.0)
-        found.append(_take_mutual(similarity, chunk.start))
-    pair, row_a, row_b, distance = _join(found)
+        lines = lines / (lines[..., :2].norm(dim=-1, keepdim=True).clamp(min=1e-12) * band[j][:, None, None])
+        outside = _compare_places(lines, octaves[i], padding[i], rays[j], octaves[j], padding[j]) > 1
+        similarity = torch.bmm(descriptors[i], descriptors[j].mT).masked_fill_(outside, -1.0)
+        return _take_mutual(similarity, start)
+
+    pair, row_a, row_b, distance = _join(map_in_threads(match_chunk, range(0, len(pairs), BATCH)))
     return KeypointMatches(pairs[pair], np.stack([row_a, row_b], axis=1), distance)
+
+
+def _compare_places(
+    lines: Tensor, octaves_a: Tensor, padding_a: Tensor, rays_b: Tensor, octaves_b: Tensor, padding_b: Tensor
+) -> Tensor:
+    """(B, N, N): squared distance of keypoint b to the line of keypoint a, and squared difference of their sizes.
+
+    Both are in units of their limits. The squares are multiplied out, so that one product finds their sum.
+    """
+    x, y, w = lines.unbind(2)
+    of_a = [x * x, y * y, 2 * x * y, 2 * x * w, 2 * y * w, w * w + octaves_a**2 + padding_a, -2 * octaves_a]
+    u, v, one = rays_b.unbind(2)
+    of_b = [u * u, v * v, u * v, u, v, one, octaves_b]
+    of_a, of_b = [*of_a, one], [*of_b, octaves_b**2 + padding_b]
+    return torch.bmm(torch.stack(of_a, 2), torch.stack(of_b, 1))
 
 
 def _take_mutual(similarity: Tensor, first: int) -> tuple[np.ndarray, ...]:
     """Pair, row a, row b and descriptor distance of what is each other's best and clearly the best."""
-    best, to_b = similarity.max(dim=2)
-    to_a = similarity.max(dim=1).indices
-    rows = torch.arange(similarity.shape[1])
-    mutual = (to_a.gather(1, to_b) == rows) & (best > 1 - MAX_DISTANCE**2 / 2)
-    pair, row_a = mutual.nonzero(as_tuple=True)
-    row_b, value = to_b[pair, row_a], best[pair, row_a]
-    of_a = similarity[pair, row_a].scatter_(1, row_b[:, None], -1.0).amax(1)
-    clear = (1 - value) < RATIO**2 * (1 - of_a)
-    pair, row_a, row_b, value = pair[clear], row_a[clear], row_b[clear], value[clear]
+    best_of_a, best_of_b = similarity.amax(2), similarity.amax(1)
+    pair, row_a = (best_of_a > 1 - MAX_DISTANCE**2 / 2).nonzero(as_tuple=True)
+    of_a = similarity[pair, row_a]
+    value, row_b = of_a.max(1)
+    of_a.scatter_(1, row_b[:, None], -1.0)
+    kept = (value == best_of_b[pair, row_b]) & ((1 - value) < RATIO**2 * (1 - of_a.amax(1)))
+    pair, row_a, row_b, value = pair[kept], row_a[kept], row_b[kept], value[kept]
     distance = (2 - 2 * value).clamp(min=0).sqrt()
     return (pair + first).numpy(), row_a.numpy(), row_b.numpy(), distance.numpy()
 

@@ -72,15 +72,25 @@ def choose_pairs(frames: MapFrames, depth: float) -> np.ndarray:
 
 
 def _measure_overlaps(frames: MapFrames, depth: float) -> np.ndarray:
-    """(F, F): the share of frame i's image, at the nominal depth, that frame j sees."""
-    x, y = np.meshgrid(*(np.linspace(-1, 1, n) for n in GRID))
+    """(F, F): the share of frame i's image, at the nominal depth, that frame j sees.
+
+    A camera sees what lies inside the four planes through its centre and the sides of its image: one product of all
+    planes with all points.
+    """
+    n = len(frames)
+    x, y = np.meshgrid(*(np.linspace(-1, 1, count) for count in GRID))
     unit = np.column_stack([x.ravel(), y.ravel()])
-    overlap = np.empty((len(frames), len(frames)))
-    for i in range(len(frames)):
-        local = np.column_stack([unit * frames.half_view[i], np.ones(len(unit))]) * depth
-        world = local @ frames.rotation[i].T + frames.position[i]
-        seen = np.einsum("fgk,fkl->fgl", world[None] - frames.position[:, None], frames.rotation)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            inside = (np.abs(seen[..., :2] / seen[..., 2:]) <= frames.half_view[:, None]).all(axis=2)
-        overlap[i] = (inside & (seen[..., 2] > 0)).mean(axis=1)
+    local = np.concatenate([unit * frames.half_view[:, None], np.ones((n, len(unit), 1))], axis=2) * depth
+    centre = frames.position - frames.position.mean(axis=0)  # float32 has no digits for a far origin
+    world = local @ np.swapaxes(frames.rotation, 1, 2) + centre[:, None]
+    points = np.concatenate([world, np.ones((n, len(unit), 1))], axis=2).astype(np.float32)
+    outward = np.zeros((n, 4, 3))
+    outward[:, [0, 1], 0] = outward[:, [2, 3], 1] = [1, -1]
+    outward[:, :, 2] = -frames.half_view[:, [0, 0, 1, 1]]
+    normal = outward @ np.swapaxes(frames.rotation, 1, 2)
+    offset = -(normal @ centre[:, :, None])
+    planes = np.moveaxis(np.concatenate([normal, offset], axis=2), 1, 0).reshape(4 * n, 4).astype(np.float32)
+    overlap = np.empty((n, n))
+    for i, view in enumerate(points):
+        overlap[i] = ((planes @ view.T).reshape(4, n, -1).max(axis=0) <= 0).mean(axis=1)
     return overlap

@@ -29,25 +29,17 @@ def join_tracks(
     nodes, index = np.unique(ids, return_inverse=True)
     index = index.reshape(-1, 2)
     parent = list(range(len(nodes)))
-    frame_of = (nodes // n_keypoints).tolist()
-    members: list[set[int] | None] = [None] * len(nodes)
+    members = [1 << frame for frame in (nodes // n_keypoints).tolist()]  # of each root: one bit for each frame
     order = np.lexsort((ids[:, 1], ids[:, 0], matches.distance))
-    for a, b in index[order].tolist():
+    for a, b in zip(*index[order].T.tolist(), strict=True):
         while parent[a] != a:
-            parent[a] = parent[parent[a]]
-            a = parent[a]
+            parent[a] = a = parent[parent[a]]
         while parent[b] != b:
-            parent[b] = parent[parent[b]]
-            b = parent[b]
-        if a == b:
-            continue
-        of_a = members[a] or {frame_of[a]}
-        of_b = members[b] or {frame_of[b]}
-        if len(of_a) < len(of_b):
-            a, b, of_a, of_b = b, a, of_b, of_a
-        if of_a.isdisjoint(of_b):
-            of_a |= of_b
-            members[a], members[b] = of_a, None
+            parent[b] = b = parent[parent[b]]
+        if a != b and not members[a] & members[b]:
+            if a > b:
+                a, b = b, a
+            members[a] |= members[b]
             parent[b] = a
     for node in range(len(nodes)):
         root = node
