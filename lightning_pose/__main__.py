@@ -25,6 +25,7 @@ VERBS = {
         "tables of finished runs: systems by scenes, beside baselines and published rows",
     ),
     "check": ("lightning_pose.commands.check", "say what a dataset holds, and what is wrong with it"),
+    "export-map": ("lightning_pose.commands.export_map", "write a landmark map as a COLMAP model and as PLY"),
     "synth": ("lightning_pose.commands.synth", "render a synthetic room as a dataset"),
 }
 
@@ -44,7 +45,7 @@ Every option  python -m lightning_pose VERB --help"""
 
 def usage() -> str:
     """The page that `--help` prints."""
-    return USAGE.format(verbs="\n".join(f"  {verb:10}{says}" for verb, (_, says) in VERBS.items()))
+    return USAGE.format(verbs="\n".join(f"  {verb:12}{says}" for verb, (_, says) in VERBS.items()))
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -110,8 +110,8 @@ class Localizer:
                 raise ConfigError(f"{type(self.model).__name__} does not use cameras; leave camera out")
             features = _stack_features(extractor, extractor.extract(arrays))
             return answer_by_network(Pose(*locate_sequence(self.model, features, *self.clips)[:2]))
-        view, refinement = self.model.map_camera, self.model.refinement
-        for_map = arrays if view is None else enlarge_images(arrays, view, camera)
+        network, refinement = self.model.map_network, self.model.refinement
+        for_map = arrays if network is None else enlarge_images(arrays, network.view, camera)
         records = extractor.extract(for_map if refinement is None else arrays)
         keypoints = None
         if refinement is not None:

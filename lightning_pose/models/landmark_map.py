@@ -126,8 +126,8 @@ class LandmarkMap(TrainingMemory, PoseModule):
         return self.network.locate(batch.features, self._list_cameras(batch.frame))
 
     @property
-    def map_camera(self) -> Camera | None:
-        return self.network.view if len(self.network.position) else None
+    def map_network(self) -> MapNetwork | None:
+        return self.network if len(self.network.position) else None
 
     def locate_images(
         self,

@@ -18,6 +18,7 @@ from lightning_pose.models.parts.answers import Answers, answer_by_map, answer_b
 from lightning_pose.models.parts.checkpoint_hooks import CheckpointHooks
 from lightning_pose.models.parts.error_radius import ErrorRadius
 from lightning_pose.models.parts.frame_cameras import scale_cameras
+from lightning_pose.models.parts.map_network import MapNetwork
 from lightning_pose.models.parts.poses import Pose
 from lightning_pose.models.parts.refinement import MapRefinement, MapSettings
 from lightning_pose.models.parts.world_frame import WorldFrame
@@ -127,11 +128,9 @@ class RefinedModule(CheckpointHooks):
         return replace_accepted(pose, self.refinement.locate_frames(frame.tolist()), self.world_frame)
 
     @property
-    def map_camera(self) -> Camera | None:
-        """The camera of the images that a map was built of; None without a map."""
-        if self.refinement is None or not self.refinement.has_map:
-            return None
-        return self.refinement.network.view
+    def map_network(self) -> MapNetwork | None:
+        """The landmark map of this system; None where it has none, or none yet."""
+        return None if self.refinement is None or not self.refinement.has_map else self.refinement.network
 
     def locate_images(
         self,
