@@ -5,14 +5,20 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from lightning_pose.errors import ConfigError, ImageError
 from lightning_pose.features.base import FeatureExtractor
+from lightning_pose.geometry.camera import Camera
+from lightning_pose.scenes.cameras import scale_camera
 
-__all__ = ["read_images"]
+__all__ = ["enlarge_images", "read_images"]
 
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv", ".3gp")
+
+MIN_ENLARGEMENT, MAX_ENLARGEMENT = 1.2, 4.0
+"""By how much images are enlarged at least, and at most."""
 
 REMEDY = "give an image file, a uint8 array, or a list of these"
 
@@ -58,3 +64,34 @@ def _describe(value: object) -> str:
     """A value's type and beginning, for a message."""
     text = repr(value)
     return f"{text if len(text) <= 40 else text[:40] + '...'} ({type(value).__name__})"
+
+
+def enlarge_images(arrays: list[np.ndarray], view: Camera, camera: Camera | None) -> list[np.ndarray]:
+    """Images in which a pixel is as small an angle as in a map's images; the same list where none is too small.
+
+    Keypoints of small images are too few and too uncertain for a map of larger ones: in images of half the size they
+    locate three times worse, and in the same images enlarged as well as in the large ones.
+
+    Args:
+        arrays: (H, W) or (H, W, 3).
+        view: the camera of the map's images.
+        camera: of these images, scaled to each; `view` if None.
+
+    Raises:
+        ConfigError: an image has another shape than those that the camera is for.
+    """
+    known = view if camera is None else camera
+    factors = [
+        view.focal_px / scale_camera(known, array.shape[1], array.shape[0], setting="camera").focal_px
+        for array in arrays
+    ]
+    if max(factors) < MIN_ENLARGEMENT:
+        return arrays
+    enlarged = []
+    for array, factor in zip(arrays, factors, strict=True):
+        if factor >= MIN_ENLARGEMENT:
+            factor = min(factor, MAX_ENLARGEMENT)
+            size = round(array.shape[1] * factor), round(array.shape[0] * factor)
+            array = cv2.resize(array, size, interpolation=cv2.INTER_CUBIC)
+        enlarged.append(array)
+    return enlarged

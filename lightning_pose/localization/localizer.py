@@ -14,7 +14,7 @@ from lightning_pose.errors import CheckpointError, ConfigError
 from lightning_pose.features.base import FeatureExtractor, Record
 from lightning_pose.geometry.camera import Camera
 from lightning_pose.geometry.relative import RelativeFrame
-from lightning_pose.localization.inputs import read_images
+from lightning_pose.localization.inputs import enlarge_images, read_images
 from lightning_pose.localization.sequences import locate_sequence
 from lightning_pose.scenes.images import to_gray
 
@@ -105,20 +105,22 @@ class Localizer:
         extractor, arrays = self.extractor, read_images(images, self.extractor)
         if not arrays:
             return answer_by_network(Pose(torch.zeros(0, 3), torch.zeros(0, 4)))
-        records = extractor.extract(arrays)
-        features = _stack_features(extractor, records)
         if self.clips is not None:
             if camera is not None:
                 raise ConfigError(f"{type(self.model).__name__} does not use cameras; leave camera out")
+            features = _stack_features(extractor, extractor.extract(arrays))
             return answer_by_network(Pose(*locate_sequence(self.model, features, *self.clips)[:2]))
+        view, refinement = self.model.map_camera, self.model.refinement
+        for_map = arrays if view is None else enlarge_images(arrays, view, camera)
+        records = extractor.extract(for_map if refinement is None else arrays)
         keypoints = None
-        if self.model.refinement is not None:
-            of_map = self.model.refinement.extractor
-            if not of_map.shares_records(extractor):
-                records = of_map.extract([to_gray(array) for array in arrays])
-            keypoints = _stack_features(of_map, records)
+        if refinement is not None:
+            shared = for_map is arrays and refinement.extractor.shares_records(extractor)
+            of_map = records if shared else refinement.extractor.extract([to_gray(array) for array in for_map])
+            keypoints = _stack_features(refinement.extractor, of_map)
+        sizes = [array.shape[1::-1] for array in for_map]
         with torch.inference_mode():
-            return self.model.locate_images(features, [array.shape[1::-1] for array in arrays], camera, keypoints)
+            return self.model.locate_images(_stack_features(extractor, records), sizes, camera, keypoints)
 
 
 def _stack_features(extractor: FeatureExtractor, records: Sequence[Record]) -> torch.Tensor:

@@ -125,6 +125,10 @@ class LandmarkMap(TrainingMemory, PoseModule):
         """What the map says of frames of the trainer's data module, in the map's own unit."""
         return self.network.locate(batch.features, self._list_cameras(batch.frame))
 
+    @property
+    def map_camera(self) -> Camera | None:
+        return self.network.view if len(self.network.position) else None
+
     def locate_images(
         self,
         features: Tensor,

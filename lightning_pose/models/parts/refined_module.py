@@ -126,6 +126,13 @@ class RefinedModule(CheckpointHooks):
             return pose
         return replace_accepted(pose, self.refinement.locate_frames(frame.tolist()), self.world_frame)
 
+    @property
+    def map_camera(self) -> Camera | None:
+        """The camera of the images that a map was built of; None without a map."""
+        if self.refinement is None or not self.refinement.has_map:
+            return None
+        return self.refinement.network.view
+
     def locate_images(
         self,
         features: Tensor,
