@@ -43,6 +43,8 @@ def test_the_docs_load_it_in_a_copied_project(
     run, image = trained.run.info.run_id, str(next((scene / "seq-03").glob("*.png")))
     shutil.copytree(trained.workplace.folder, tmp_path / "copy")
     monkeypatch.chdir(tmp_path / "copy")
+    # MLflow keeps an open store by its address, and a relative one is that of another test's folder
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path}/copy/mlruns/mlflow.db")
     page = (REPOSITORY / "docs" / "usage.md").read_text()
     code = page.split("```python\n")[1].split("```")[0].replace("RUN_ID", run).replace("image.jpg", image)
     names: dict[str, pd.DataFrame] = {}

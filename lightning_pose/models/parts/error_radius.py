@@ -52,7 +52,7 @@ class ErrorRadius(nn.Module):
         self.register_buffer("reference", torch.zeros(0, DIMENSIONS))
         self.register_buffer("mean", torch.zeros(width))
         self.register_buffer("floor", torch.zeros(()))
-        self.register_buffer("factors", torch.full((2,), torch.nan))
+        self.register_buffer("factors", torch.zeros(2))  # 0 is unknown
         self._scores: list[Tensor] = []
         self.register_load_state_dict_pre_hook(_fit_before_load)
 
@@ -79,14 +79,14 @@ class ErrorRadius(nn.Module):
         return scores
 
     def calibrate(self, scores: Tensor) -> None:
-        """Find the factors from (N, 3) distances and errors; nan from too few."""
+        """Find the factors from (N, 3) distances and errors; they stay unknown if there are too few."""
         if not len(scores):
             return
         distance, *errors = scores.double().cpu().T
         self.floor.fill_(float(distance.median()))
         scale = (distance + distance.median()).clamp(min=1e-9).numpy()
         factors = [find_conformal_factor(error.numpy() / scale) for error in errors]
-        self.factors.copy_(torch.tensor(factors))
+        self.factors.copy_(torch.tensor(factors).nan_to_num(0.0))
 
     def find_radii(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """(B,) radii in the scene's unit and in degrees; nan where they are unknown."""
@@ -94,7 +94,7 @@ class ErrorRadius(nn.Module):
             unknown = torch.full((len(features),), torch.nan)
             return unknown, unknown
         scale = (self.measure_distance(features) + self.floor).double().cpu()
-        position, orientation = self.factors.tolist()
+        position, orientation = (factor or np.nan for factor in self.factors.tolist())
         return scale * position, scale * orientation
 
     def resize(self, state_dict: dict[str, Tensor]) -> None:

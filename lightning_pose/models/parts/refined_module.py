@@ -95,7 +95,7 @@ class RefinedModule(CheckpointHooks):
 
     def add_errors(self, features: Tensor, pose: Pose, truth: Pose) -> None:
         """Add a validation batch of the regressor's own poses, in the world, to what its radii are found from."""
-        if self.radius is not None and not self.trainer.sanity_checking:
+        if self.radius is not None and len(self.radius.reference) and not self.trainer.sanity_checking:
             errors = (
                 position_error_m(pose.position_m, truth.position_m),
                 orientation_error_deg(pose.quat_wxyz.double(), truth.quat_wxyz.double()),
