@@ -52,6 +52,15 @@ def test_without_a_camera_the_focal_length_is_found_and_printed(capsys: pytest.C
     assert position_error_m(model(data.features).position_m, data.position_m).median() < 0.03
 
 
+def test_without_a_map_and_a_camera_frames_are_refused() -> None:
+    """As validation does that comes before training."""
+    problem = WallProblem([WALL_KEYPOINTS, 36], cameras=[None])
+    model = LandmarkMap(input_shape=[WALL_KEYPOINTS, 36])
+    model.trainer = Trainer(accelerator="cpu", logger=False, enable_checkpointing=False)
+    position, _ = model.decode_batch(problem.dataset("test").data)
+    assert position.isfinite().all()
+
+
 def test_each_frame_has_its_own_camera(capsys: pytest.CaptureFixture[str]) -> None:
     """Two cameras with distortion, of images that differ in size; one of them is a fisheye."""
     cameras = [
