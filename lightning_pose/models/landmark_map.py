@@ -142,7 +142,7 @@ class LandmarkMap(TrainingMemory, PoseModule):
         return answer_by_map(convert_answers(found, self.world_frame), found, self.network, self.world_frame.scale)
 
     def _list_cameras(self, frames: Tensor) -> list[Camera] | None:
-        """The cameras of frames of the trainer's data module, the map's for unknown ones; None before there is a map."""
+        """The cameras of frames of the trainer's data module, the map's for unknown ones; None without a map."""
         if self.map_network is None:
             return None
         return list_cameras(scene_datamodule(self.trainer), frames.tolist(), self.network.view)
