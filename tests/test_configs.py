@@ -21,7 +21,7 @@ FIGURES = {
     "ImageDataModule": {"trajectory.png", "cumulative_errors.png", "error_vs_distance.png"},
     "ClipDataModule": {"trajectory.png", "error_by_length.png"},
 }
-MAP_FIGURES = {"map.png", "error_vs_inliers.png"}
+MAP_FIGURES = {"map.png", "error_vs_inliers.png", "matched_images.png"}
 every_config = pytest.mark.parametrize("config", CONFIGS, ids=lambda path: f"{path.parent.name}-{path.stem}")
 
 

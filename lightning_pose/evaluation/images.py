@@ -14,7 +14,7 @@ from lightning_pose.data.batches import PoseBatch
 from lightning_pose.data.datamodule import SceneDataModule, scene_datamodule
 from lightning_pose.evaluation.baselines.images import BaselineResult, evaluate_baselines
 from lightning_pose.evaluation.costs import costs
-from lightning_pose.evaluation.maps import MapEvaluation, evaluate_map, measure_coverage
+from lightning_pose.evaluation.maps import MapEvaluation, draw_examples, evaluate_map, measure_coverage
 from lightning_pose.evaluation.result import Evaluation, skill
 from lightning_pose.figures import images as image_figures
 from lightning_pose.figures.maps import draw_calibration
@@ -60,7 +60,7 @@ def evaluate_images(trainer: Trainer, module: PoseModule, located: Located, mode
     poses = {name: Pose(*(tensor.double() for tensor in prediction)), **baselines}
     frames = [scene.frames[i] for i in test.frame.tolist()]
     metrics = {system: result.metrics for system, result in baselines.items()}
-    on_map = _evaluate_map(module, prediction, scene, test)
+    on_map = _evaluate_map(module, prediction, datamodule, test)
     return Evaluation(
         baselines=metrics,
         rows=on_map.rows,
@@ -70,16 +70,20 @@ def evaluate_images(trainer: Trainer, module: PoseModule, located: Located, mode
     )
 
 
-def _evaluate_map(module: PoseModule, prediction: Pose, scene: Scene, test: PoseBatch) -> MapEvaluation:
+def _evaluate_map(module: PoseModule, prediction: Pose, datamodule: SceneDataModule, test: PoseBatch) -> MapEvaluation:
     """What only a map has, or a system with one beside it; empty for others."""
+    network, scene = module.map_network, datamodule.scene
+    if network is None:
+        return _evaluate_radius(module, prediction, scene, test)
     if isinstance(module, LandmarkMap):
         answers = module.locate_frames(test)
-        return evaluate_map(module.network, answers, module.world_frame, prediction, scene, test, module.system_name)
-    refinement = module.refinement
-    if refinement is None or not refinement.has_map:
-        return _evaluate_radius(module, prediction, scene, test)
-    answers = refinement.locate_frames(test.frame.tolist())
-    found = evaluate_map(refinement.network, answers, module.world_frame, prediction, scene, test, module.system_name)
+    else:
+        assert module.refinement is not None, "it has the map"
+        answers = module.refinement.locate_frames(test.frame.tolist())
+    found = evaluate_map(network, answers, module.world_frame, prediction, scene, test, module.system_name)
+    found.figures |= draw_examples(network, answers, prediction, test, datamodule, module.system_name)
+    if isinstance(module, LandmarkMap):
+        return found
     alone = _measure_alone(module, test)
     found.metrics |= {f"test/alone_{name}": alone[name] for name in MEDIANS}
     return replace(found, rows={**found.rows, f"{type(module).__name__} alone": alone})

@@ -10,16 +10,22 @@ import torch
 from matplotlib.figure import Figure
 
 from lightning_pose.data.batches import PoseBatch
+from lightning_pose.data.datamodule import SceneDataModule
 from lightning_pose.figures import maps as map_figures
 from lightning_pose.geometry.quaternions import orientation_error_deg, position_error_m
 from lightning_pose.mapping.map_localizer import MapAnswer
 from lightning_pose.metrics.summary import summarize_errors
 from lightning_pose.models.base import Pose
+from lightning_pose.models.parts.frame_cameras import list_cameras
 from lightning_pose.models.parts.map_network import MapNetwork
 from lightning_pose.models.parts.world_frame import WorldFrame
+from lightning_pose.scenes.images import read_rgb
 from lightning_pose.scenes.scene import Scene
 
-__all__ = ["MapEvaluation", "evaluate_map", "measure_coverage"]
+__all__ = ["MapEvaluation", "draw_examples", "evaluate_map", "measure_coverage"]
+
+EXAMPLE_RANKS = (0.0, 0.5, 0.9, 1.0)
+"""Of errors, at which test frames are shown."""
 
 Errors = tuple[np.ndarray, np.ndarray]
 """Of positions (N,) in the scene's unit, and of orientations (N,) in degrees."""
@@ -96,6 +102,43 @@ def evaluate_map(
             unit=scene.unit,
         )
     return MapEvaluation(metrics, rows, figures)
+
+
+def draw_examples(
+    network: MapNetwork,
+    answers: Sequence[MapAnswer],
+    prediction: Pose,
+    test: PoseBatch,
+    datamodule: SceneDataModule,
+    name: str,
+) -> dict[str, Figure]:
+    """Four test frames with the points of the map in them, by rank of their position error; nothing if all are refused.
+
+    Args:
+        network: with a map.
+        answers: of the map for the test frames.
+        prediction: poses of the test frames in the world.
+        test: the frames that were tested.
+        datamodule: of the frames.
+        name: of the system.
+    """
+    error_m = position_error_m(prediction.position_m.double(), test.position_m.double()).numpy()
+    order = [int(i) for i in np.argsort(error_m, kind="stable") if answers[int(i)].shown is not None]
+    if not order:
+        return {}
+    ranks = {f"{rank:.0%} of errors are smaller": order[round(rank * (len(order) - 1))] for rank in EXAMPLE_RANKS}
+    correction, scene = network.point_map.camera_correction, datamodule.scene
+    images = []
+    for caption, row in ranks.items():
+        answer, frame = answers[row], int(test.frame[row])
+        (camera,) = list_cameras(datamodule, [frame], network.view)
+        shown = answer.shown
+        assert shown is not None, "chosen for it"
+        seen, projected, observed = (camera.project(correction.distort(each)) for each in shown[:3])
+        about = f"{caption}: {error_m[row]:.3g} {scene.unit}, {answer.reason or 'accepted'}"
+        pixels = read_rgb(scene.frames[frame].image)
+        images.append(map_figures.MatchedImage(pixels, seen, projected, observed, shown.inlier, about))
+    return {"matched_images": map_figures.draw_matched_images(images, f"{name} on {scene.name}, test frames")}
 
 
 def measure_coverage(errors: Errors, radii: Errors) -> dict[str, float]:

@@ -6,11 +6,12 @@
 from lightning_pose.features.base import FeatureExtractor, LocalExtractor
 from lightning_pose.features.cache import FeatureCache, FillReport
 from lightning_pose.features.cnn import CNN
-from lightning_pose.features.opencv import BRIEF, FREAK, ORB, SIFT
+from lightning_pose.features.opencv import AKAZE, BRIEF, FREAK, ORB, SIFT
 from lightning_pose.features.pixels import Pixels
 from lightning_pose.features.surf import SURF
 
 __all__ = [
+    "AKAZE",
     "BRIEF",
     "CNN",
     "FREAK",

@@ -1,4 +1,4 @@
-"""The features with which the thesis compares SURF (fig. 3.5): SIFT, ORB, FREAK and BRIEF, by OpenCV."""
+"""The features with which the thesis compares SURF (fig. 3.5), SIFT, ORB, FREAK and BRIEF, and AKAZE, by OpenCV."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from lightning_pose.features.base import LocalExtractor, Record
 
-__all__ = ["BRIEF", "FREAK", "ORB", "SIFT"]
+__all__ = ["AKAZE", "BRIEF", "FREAK", "ORB", "SIFT"]
 
 Settings = Mapping[str, str | int | float | bool | None]
 Describe = Callable[[np.ndarray], tuple[Sequence[cv2.KeyPoint], np.ndarray | None]]
@@ -60,7 +60,7 @@ class _OpenCVExtractor(LocalExtractor):
             x, y, size, response, angle = rows.T
             order = np.lexsort((angle, size, x, y, -response))[:count]
             keypoints[:count] = rows[order]
-            descriptors[:count] = _normalise_rows(raw[order])
+            descriptors[:count] = _normalise_rows(raw[order], self.descriptor_dim)
         return {
             "descriptors": descriptors,
             "keypoints": keypoints,
@@ -69,9 +69,9 @@ class _OpenCVExtractor(LocalExtractor):
         }
 
 
-def _normalise_rows(raw: np.ndarray) -> np.ndarray:
-    """Unit rows (n, D) float32 from rows of floats or of packed bits."""
-    rows = np.unpackbits(raw, axis=1) * np.float32(2) - 1 if raw.dtype == np.uint8 else raw
+def _normalise_rows(raw: np.ndarray, columns: int) -> np.ndarray:
+    """Unit rows (n, columns) float32 from rows of floats, or of packed bits, of which the last byte may be padded."""
+    rows = np.unpackbits(raw, axis=1, count=columns) * np.float32(2) - 1 if raw.dtype == np.uint8 else raw
     norms = np.linalg.norm(rows, axis=1, keepdims=True)
     return rows / np.maximum(norms, np.finfo(np.float32).tiny)
 
@@ -123,6 +123,29 @@ class ORB(_OpenCVExtractor):
     def _describer(self) -> Describe:
         orb = cv2.ORB.create(self.n_stored, fastThreshold=self.fast_threshold)
         return lambda image: orb.detectAndCompute(image, None)
+
+
+class AKAZE(_OpenCVExtractor):
+    """Accelerated KAZE (Alcantarilla, Nuevo, Bartoli 2013), 486 columns: keypoints of a nonlinear scale space.
+
+    Args:
+        n_features: N, how many of the strongest features the networks read.
+        with_geometry: append normalised x, y, log size and response.
+        threshold: of the detector's response; lower finds more features in plain images (OpenCV's default is 0.001).
+    """
+
+    descriptor_dim = 486
+
+    def __init__(self, n_features: int = 300, with_geometry: bool = False, threshold: float = 0.0003) -> None:
+        super().__init__(n_features, with_geometry)
+        self.threshold = threshold
+
+    def _options(self) -> Settings:
+        return {"threshold": self.threshold}
+
+    def _describer(self) -> Describe:
+        akaze = cv2.xfeatures2d.AKAZE.create(threshold=self.threshold)
+        return lambda image: akaze.detectAndCompute(image, None)
 
 
 class _FastCorners(_OpenCVExtractor):

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import matplotlib
 import numpy as np
 from matplotlib.collections import LineCollection
@@ -20,9 +23,54 @@ from lightning_pose.figures.style import (
     log_axis,
 )
 
-__all__ = ["draw_calibration", "draw_error_vs_inliers", "draw_map"]
+__all__ = ["MatchedImage", "draw_calibration", "draw_error_vs_inliers", "draw_map", "draw_matched_images"]
 
 REFUSED = "#D55E00"
+
+
+class MatchedImage(NamedTuple):
+    """An image and what a map shows in it, in pixels.
+
+    Attributes:
+        pixels: (H, W) or (H, W, 3) uint8.
+        seen: (V, 2), where points of the map appear that the image should show.
+        projected: (K, 2), where those appear that were matched.
+        observed: (K, 2), their keypoints.
+        inlier: (K,) bool.
+        caption: above the image.
+    """
+
+    pixels: np.ndarray
+    seen: np.ndarray
+    projected: np.ndarray
+    observed: np.ndarray
+    inlier: np.ndarray
+    caption: str
+
+
+@matplotlib.rc_context(STYLE)
+def draw_matched_images(images: Sequence[MatchedImage], title: str = "Points of the map in images") -> Figure:
+    """Images in two columns, with the map's points in them, and a segment from each matched one to its keypoint."""
+    rows = -(-len(images) // 2)
+    figure = Figure(figsize=(11, 4.3 * rows + 0.6), dpi=110, layout="constrained")
+    figure.suptitle(title)
+    for axes, image in zip(figure.subplots(rows, 2, squeeze=False).flat, images, strict=False):
+        height, width = image.pixels.shape[:2]
+        axes.imshow(image.pixels, cmap="gray", vmin=0, vmax=255)
+        axes.plot(*image.seen.T, ".", color="#f0e442", markersize=1.5, label=f"{len(image.seen)} points in view")
+        for chosen, color, label in ((image.inlier, MODEL, "inliers"), (~image.inlier, REFUSED, "other matches")):
+            segments = list(np.stack([image.projected[chosen], image.observed[chosen]], axis=1))
+            axes.add_collection(LineCollection(segments, colors=color, linewidths=1))
+            axes.plot(
+                *image.observed[chosen].T, "o", color=color, markersize=4, markerfacecolor="none", markeredgewidth=0.8,
+                label=f"{chosen.sum()} {label}",
+            )  # fmt: skip
+        axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
+        axes.set_title(image.caption, fontsize=9)
+        axes.legend(loc="lower right", fontsize=7)
+    for axes in list(figure.axes)[len(images) :]:
+        axes.set_axis_off()
+    return figure
 
 
 @matplotlib.rc_context(STYLE)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lightning_pose.geometry.absolute_pose import CameraPose
 from lightning_pose.geometry.triangulation import (
     find_midpoints,
     refine_points,
@@ -24,6 +26,7 @@ from lightning_pose.mapping.tracks import join_tracks
 __all__ = [
     "MappedFrames",
     "Tracks",
+    "add_frames",
     "adjust_mapped",
     "build_point_map",
     "map_frames",
@@ -80,13 +83,18 @@ class MappedFrames:
         given: the frames with the poses that the dataset gives.
         seen: the same with the poses and keypoints of the map's own cameras.
         tracks: the map's points and their observations.
-        camera: what was wrong with the assumed camera.
+        state: what bundle adjustment found, from which another goes on; None before the first.
     """
 
     given: MapFrames
     seen: MapFrames
     tracks: Tracks
-    camera: CameraCorrection
+    state: Adjustment | None = None
+
+    @property
+    def camera(self) -> CameraCorrection:
+        """What was wrong with the assumed camera."""
+        return CameraCorrection() if self.state is None else self.state.camera
 
 
 def build_point_map(frames: MapFrames, adjust: bool = False) -> PointMap:
@@ -102,10 +110,8 @@ def map_frames(frames: MapFrames, adjust: bool) -> MappedFrames:
         adjust: move poses, points and camera until they agree with the images, twice: poses that are better find
             more matches. Without it, the given poses are taken as they are.
     """
-    seen, tracks = frames, triangulate_tracks(frames, find_tracks(frames))
-    if not adjust:
-        return MappedFrames(frames, seen, tracks, CameraCorrection())
-    return adjust_mapped(MappedFrames(frames, seen, tracks, CameraCorrection()))
+    mapped = MappedFrames(frames, frames, triangulate_tracks(frames, find_tracks(frames)))
+    return adjust_mapped(mapped) if adjust else mapped
 
 
 def adjust_mapped(mapped: MappedFrames) -> MappedFrames:
@@ -115,11 +121,48 @@ def adjust_mapped(mapped: MappedFrames) -> MappedFrames:
     for again in range(ADJUSTMENTS):
         if again:
             tracks = triangulate_tracks(seen, find_tracks(seen))
-        state = adjust_bundle(replace(state, points=tracks.points), given, tracks.track, tracks.frame, tracks.keypoint)
-        points = np.where(given.real[:, :, None], state.camera.remove(given.points), 0.0)
-        seen = replace(given.with_poses(*state.camera_poses), points=points)
-        tracks = replace(tracks, points=state.points)
-    return MappedFrames(given, seen, triangulate_tracks(seen, tracks), state.camera)
+        state, seen, tracks = _adjust_once(state, given, tracks)
+    return MappedFrames(given, seen, triangulate_tracks(seen, tracks), state)
+
+
+def add_frames(mapped: MappedFrames, given: MapFrames, rows: np.ndarray, others: Sequence[CameraPose]) -> MappedFrames:
+    """A map of more frames, whose old ones start where bundle adjustment has moved them: one round instead of two.
+
+    Args:
+        mapped: after bundle adjustment.
+        given: the frames of `mapped`, and others.
+        rows: (F,) int64, where in `given` the frames of `mapped` are.
+        others: where the other frames are in the map, in the order of `given`.
+
+    Raises:
+        ValueError: `mapped` was not adjusted.
+    """
+    old = mapped.state
+    if old is None:
+        raise ValueError("frames are added to maps after bundle adjustment")
+    rotation, position = given.rotation.copy(), given.position.copy()
+    rotation[rows], position[rows] = old.rotation, old.position
+    new = np.setdiff1d(np.arange(len(given)), rows)
+    for row, pose in zip(new, others, strict=True):
+        rotation[row] = pose.rotation @ old.offset_rotation.T
+        position[row] = pose.position - rotation[row] @ old.offset_position
+    start = replace(old, rotation=rotation, position=position)
+    seen = _move_frames(start, given)
+    tracks = triangulate_tracks(seen, find_tracks(seen))
+    state, seen, tracks = _adjust_once(start, given, tracks)
+    return MappedFrames(given, seen, triangulate_tracks(seen, tracks), state)
+
+
+def _adjust_once(state: Adjustment, given: MapFrames, tracks: Tracks) -> tuple[Adjustment, MapFrames, Tracks]:
+    """What bundle adjustment finds, and the frames and tracks as it moves them."""
+    state = adjust_bundle(replace(state, points=tracks.points), given, tracks.track, tracks.frame, tracks.keypoint)
+    return state, _move_frames(state, given), replace(tracks, points=state.points)
+
+
+def _move_frames(state: Adjustment, given: MapFrames) -> MapFrames:
+    """The frames with the poses and keypoints of the map's own cameras."""
+    points = np.where(given.real[:, :, None], state.camera.remove(given.points), 0.0)
+    return replace(given.with_poses(*state.camera_poses), points=points)
 
 
 def find_tracks(frames: MapFrames) -> Tracks:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from lightning_pose.mapping.build_map import MappedFrames, summarize_tracks, triangulate_tracks
 from lightning_pose.mapping.frames import MapFrames
 from lightning_pose.mapping.map_localizer import MapAnswer, MapLocalizer
+from lightning_pose.mapping.threads import map_in_threads
 
 __all__ = [
     "UNKNOWN",
@@ -68,15 +69,18 @@ def calibrate_map(mapped: MappedFrames) -> Calibration:
         radii by conformal prediction (Vovk, Gammerman, Shafer, 2005): the factor is the quantile of error by standard
         deviation among the accepted.
     """
-    found: list[Measured] = []
-    for block in np.array_split(np.arange(len(mapped.given)), BLOCKS):
+
+    def measure_block(block: np.ndarray) -> Measured | None:
         kept = ~np.isin(mapped.tracks.frame, block)
         if not kept.any() or not len(block):
-            continue
+            return None
         tracks = triangulate_tracks(mapped.seen, mapped.tracks.select(kept))
-        point_map = summarize_tracks(MappedFrames(mapped.given, mapped.seen, tracks, mapped.camera))
+        localizer = MapLocalizer(summarize_tracks(replace(mapped, tracks=tracks)), without=block)
         frames = mapped.given.select(block[:: max(1, len(block) // FRAMES_PER_BLOCK)])
-        found.append(measure_frames(MapLocalizer(point_map, without=block), frames))
+        return measure_answers([localizer.locate(frames.query(i)) for i in range(len(frames))], frames)
+
+    blocks = np.array_split(np.arange(len(mapped.given)), BLOCKS)
+    found = [each for each in map_in_threads(measure_block, blocks) if each is not None]
     if not found:
         return UNKNOWN
     every = Measured(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
@@ -102,7 +106,7 @@ class Measured(NamedTuple):
 
 def measure_frames(localizer: MapLocalizer, frames: MapFrames) -> Measured:
     """Locate frames, and compare the answers with the poses that the frames have."""
-    return measure_answers([localizer.locate(frames.query(i)) for i in range(len(frames))], frames)
+    return measure_answers(map_in_threads(lambda i: localizer.locate(frames.query(i)), range(len(frames))), frames)
 
 
 def measure_answers(answers: Sequence[MapAnswer], frames: MapFrames) -> Measured:

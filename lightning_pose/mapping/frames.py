@@ -6,7 +6,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-__all__ = ["MapFrames", "MapQuery"]
+__all__ = ["MapFrames", "MapQuery", "find_distance_scale"]
+
+BINARY_SCALE = 2.0
+"""Distance of two binary descriptors of one point by that of two SURF descriptors, for which thresholds are chosen."""
+
+
+def find_distance_scale(descriptors: np.ndarray) -> float:
+    """By how much descriptors of one point differ more than those of SURF: binary ones have elements of one size.
+
+    Args:
+        descriptors: (N, D), unit rows, or rows of zeros.
+    """
+    first = np.abs(descriptors[:1])
+    binary = len(first) > 0 and first.max() > 0 and first.min() > 0.99 * first.max()
+    return BINARY_SCALE if binary else 1.0
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from lightning_pose.geometry.epipolar import essential_matrices
-from lightning_pose.mapping.frames import MapFrames
+from lightning_pose.mapping.frames import MapFrames, find_distance_scale
 from lightning_pose.mapping.threads import map_in_threads
 
 __all__ = ["KeypointMatches", "match_pairs"]
@@ -28,6 +28,9 @@ RATIO = 0.8
 
 FAR = 1e6
 """Squared distance of rows that are no keypoints from all others."""
+
+SAMPLE = 10
+"""Frames of which one at least has keypoints, to look at their descriptors."""
 
 BATCH = 4
 """Pairs matched at once: as many as fit a processor's cache."""
@@ -71,6 +74,7 @@ def match_pairs(frames: MapFrames, pairs: np.ndarray, band_px: float = BAND_PX) 
     octaves = torch.from_numpy(np.log2(size) / np.log2(SIZE_RATIO)).float()
     padding = torch.from_numpy(np.where(frames.real, 0.0, FAR)).float()
     band = torch.from_numpy(band_px / frames.focal_px).float()
+    scale = max((find_distance_scale(rows) for rows in frames.descriptors[:SAMPLE]), default=1.0)
 
     def match_chunk(start: int) -> tuple[np.ndarray, ...]:
         chunk = slice(start, start + BATCH)
@@ -78,7 +82,10 @@ def match_pairs(frames: MapFrames, pairs: np.ndarray, band_px: float = BAND_PX) 
         lines = rays[i] @ torch.from_numpy(essential[chunk]).float().mT
         lines = lines / (lines[..., :2].norm(dim=-1, keepdim=True).clamp(min=1e-12) * band[j][:, None, None])
         outside = _compare_places(lines, octaves[i], padding[i], rays[j], octaves[j], padding[j]) > 1
-        similarity = torch.bmm(descriptors[i], descriptors[j].mT).masked_fill_(outside, -1.0)
+        similarity = torch.bmm(descriptors[i], descriptors[j].mT)
+        if scale != 1:  # as if the descriptors differed so many times less
+            similarity = similarity.sub_(1).div_(scale**2).add_(1)
+        similarity = similarity.masked_fill_(outside, -1.0)
         return _take_mutual(similarity, start)
 
     pair, row_a, row_b, distance = _join(map_in_threads(match_chunk, range(0, len(pairs), BATCH)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -12,7 +13,7 @@ from lightning_pose.mapping.frames import MapQuery
 from lightning_pose.mapping.point_map import PointMap
 from lightning_pose.mapping.query_matching import QueryMatcher
 
-__all__ = ["MapAnswer", "MapLocalizer"]
+__all__ = ["MapAnswer", "MapLocalizer", "ShownPoints"]
 
 MIN_MATCHES = 8
 """Fewer matches are no start for RANSAC."""
@@ -29,6 +30,22 @@ KERNEL = (0.05, 5.0)
 """How far training frames lend their offset to an answer: in median depths of the map's points, and degrees."""
 
 
+class ShownPoints(NamedTuple):
+    """What a map shows in an image: normalised image coordinates, the camera's error removed.
+
+    Attributes:
+        seen: (V, 2), where points appear that the image should show.
+        projected: (K, 2), where those appear that were matched.
+        observed: (K, 2), their keypoints.
+        inlier: (K,) bool, whether the two lie within 3 px.
+    """
+
+    seen: np.ndarray
+    projected: np.ndarray
+    observed: np.ndarray
+    inlier: np.ndarray
+
+
 @dataclass(frozen=True)
 class MapAnswer:
     """Where an image was taken, and how sure the map is.
@@ -43,6 +60,7 @@ class MapAnswer:
             before a pose was refined. Calibration turns it into a radius.
         orientation_sd_deg: the same of the orientation, in degrees.
         covariance: (6, 6), of a rotation in the camera's axes (radians) and a movement in the world's.
+        shown: the points that the image shows; None if refused before a pose was refined.
     """
 
     pose: CameraPose
@@ -53,6 +71,7 @@ class MapAnswer:
     position_sd: float = np.inf
     orientation_sd_deg: float = np.inf
     covariance: np.ndarray | None = None
+    shown: ShownPoints | None = None
 
     @property
     def accepted(self) -> bool:
@@ -98,17 +117,19 @@ class MapLocalizer:
         pose, mask = found
         sigma = SIGMA_PX / query.focal_px
         pose = refine_pose(pose, self.map.points[matched[mask]], points[rows[mask]], 2 * sigma).pose
-        rows, matched, visible = self._matcher.match_guided(query, points, similarity, pose)
+        rows, matched, seen = self._matcher.match_guided(query, points, similarity, pose)
+        visible = len(seen)
         if len(rows) < MIN_MATCHES:
             return self._refuse(frame, f"too few guided matches: {len(rows)} of {visible} points in view", visible)
         refined = refine_pose(pose, self.map.points[matched], points[rows], sigma)
         local = (self.map.points[matched] - refined.pose.position) @ refined.pose.rotation
-        error = np.linalg.norm(local[:, :2] / np.maximum(local[:, 2:], 1e-9) - points[rows], axis=1)
-        inliers = int((error * query.focal_px <= INLIER_PX).sum())
+        projected = local[:, :2] / np.maximum(local[:, 2:], 1e-9)
+        inlier = np.linalg.norm(projected - points[rows], axis=1) * query.focal_px <= INLIER_PX
+        inliers = int(inlier.sum())
         reason = "" if inliers >= ACCEPT_INLIERS else f"too few guided inliers: {inliers} of {visible} points in view"
-        return self._answer(refined, inliers, visible, reason)
+        return self._answer(refined, inliers, visible, reason, ShownPoints(seen, projected, points[rows], inlier))
 
-    def _answer(self, refined: RefinedPose, inliers: int, visible: int, reason: str) -> MapAnswer:
+    def _answer(self, refined: RefinedPose, inliers: int, visible: int, reason: str, shown: ShownPoints) -> MapAnswer:
         covariance = np.linalg.pinv(refined.normal, hermitian=True)
         spread = np.maximum(np.diag(covariance), 0.0)
         return MapAnswer(
@@ -120,6 +141,7 @@ class MapLocalizer:
             float(np.sqrt(spread[3:].sum())),
             float(np.degrees(np.sqrt(spread[:3].sum()))),
             covariance,
+            shown,
         )
 
     def _refuse(self, frame: int, reason: str, visible: int = 0) -> MapAnswer:
@@ -135,11 +157,25 @@ class MapLocalizer:
         """
         if not self._adjusted:
             return pose
-        away = np.linalg.norm(self.map.position[self._kept] - pose.position, axis=1) / self._kernel
-        cosine = (np.einsum("fij,ij->f", self.map.rotation[self._kept], pose.rotation) - 1) / 2
+        turn, move = self._mean_offset(pose, self.map.rotation, self.map.position)
+        return CameraPose(pose.rotation @ turn, pose.position + pose.rotation @ move)
+
+    def carry_forward(self, pose: CameraPose) -> CameraPose:
+        """Where the map would put a camera at a pose that the dataset gives: the other way round."""
+        if not self._adjusted:
+            return pose
+        turn, move = self._mean_offset(pose, self.map.given_rotation, self.map.given_position)
+        rotation = pose.rotation @ turn.T
+        return CameraPose(rotation, pose.position - rotation @ move)
+
+    def _mean_offset(
+        self, pose: CameraPose, rotation: np.ndarray, position: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Rotation (3, 3) and movement (3,), in a camera's axes, from the map to given poses, of near frames."""
+        away = np.linalg.norm(position[self._kept] - pose.position, axis=1) / self._kernel
+        cosine = (np.einsum("fij,ij->f", rotation[self._kept], pose.rotation) - 1) / 2
         turned = np.degrees(np.arccos(np.clip(cosine, -1, 1))) / KERNEL[1]
         squared = away**2 + turned**2
         weight = np.exp(-0.5 * (squared - squared.min()))
         weight /= weight.sum()
-        turn = Rotation.from_rotvec(weight @ self._turn_back).as_matrix()
-        return CameraPose(pose.rotation @ turn, pose.position + pose.rotation @ (weight @ self._move_back))
+        return Rotation.from_rotvec(weight @ self._turn_back).as_matrix(), weight @ self._move_back

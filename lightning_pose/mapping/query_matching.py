@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lightning_pose.geometry.absolute_pose import CameraPose
-from lightning_pose.mapping.frames import MapQuery
+from lightning_pose.mapping.frames import MapQuery, find_distance_scale
 from lightning_pose.mapping.point_map import PointMap
 
 __all__ = ["QueryMatcher"]
@@ -54,8 +54,9 @@ class QueryMatcher:
         self._first_of_point = np.concatenate([[0], np.cumsum(length)])
 
     def compare(self, descriptors: np.ndarray) -> np.ndarray:
-        """(N, P) cosines between an image's descriptors (N, D) and the map's."""
-        return descriptors @ self._descriptors
+        """(N, P) cosines between an image's descriptors (N, D) and the map's, as they would be of SURF."""
+        similarity, scale = descriptors @ self._descriptors, find_distance_scale(descriptors)
+        return similarity if scale == 1 else 1 - (1 - similarity) / scale**2
 
     def match_candidates(self, similarity: np.ndarray) -> tuple[int, np.ndarray, np.ndarray]:
         """Mutual matches with what the most likely training frames saw.
@@ -94,7 +95,7 @@ class QueryMatcher:
 
     def match_guided(
         self, query: MapQuery, points: np.ndarray, similarity: np.ndarray, pose: CameraPose
-    ) -> tuple[np.ndarray, np.ndarray, int]:
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Mutual matches near where a pose puts the points that it should show.
 
         Args:
@@ -104,7 +105,8 @@ class QueryMatcher:
             pose: where the camera is thought to be.
 
         Returns:
-            keypoints (K,), points (K,), and how many points should be in view.
+            keypoints (K,), points (K,), and where the points that should be in view appear, (V, 2) normalised image
+            coordinates.
         """
         away = self.map.points - pose.position
         local = away @ pose.rotation
@@ -124,7 +126,7 @@ class QueryMatcher:
         best, second = _rank_within(row, value)
         best_of_point, _ = _rank_within(point, value)
         chosen = best & best_of_point & (1 - value < GUIDED_RATIO**2 * (1 - second))
-        return row[chosen], point[chosen], len(visible)
+        return row[chosen], point[chosen], seen
 
 
 def _join_ranges(first: np.ndarray, last: np.ndarray) -> np.ndarray:

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from lightning_pose.features.base import LocalExtractor
-from lightning_pose.features.opencv import BRIEF, FREAK, ORB, SIFT
+from lightning_pose.features.opencv import AKAZE, BRIEF, FREAK, ORB, SIFT
 
-DIMS = {SIFT: 128, ORB: 256, FREAK: 512, BRIEF: 256}
-BINARY = (ORB, FREAK, BRIEF)
+DIMS = {SIFT: 128, ORB: 256, AKAZE: 486, FREAK: 512, BRIEF: 256}
+BINARY = (ORB, AKAZE, FREAK, BRIEF)
 
 
 def texture(seed: int = 0, height: int = 240, width: int = 320) -> np.ndarray:

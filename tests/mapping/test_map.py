@@ -10,7 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from lightning_pose.geometry.absolute_pose import CameraPose
-from lightning_pose.mapping.build_map import build_point_map, map_frames, summarize_tracks
+from lightning_pose.mapping.build_map import add_frames, build_point_map, map_frames, summarize_tracks
 from lightning_pose.mapping.calibration import calibrate_map, measure_frames
 from lightning_pose.mapping.frames import MapFrames, MapQuery
 from lightning_pose.mapping.map_localizer import MapLocalizer
@@ -148,6 +148,29 @@ def test_carrying_back_returns_what_the_dataset_gives(training: MapFrames) -> No
     carried = MapLocalizer(shifted).carry_back(pose)
     np.testing.assert_allclose(carried.rotation, shifted.given_rotation[20], atol=1e-9)
     np.testing.assert_allclose(carried.position, shifted.given_position[20], atol=1e-9)
+    there = MapLocalizer(shifted).carry_forward(carried)
+    np.testing.assert_allclose(there.rotation, pose.rotation, atol=1e-9)
+    np.testing.assert_allclose(there.position, pose.position, atol=1e-9)
+
+
+def test_added_frames_stand_where_a_new_adjustment_would_put_them(training: MapFrames) -> None:
+    rng = np.random.default_rng(0)
+    given = training.with_poses(training.rotation, training.position + rng.normal(0, 0.01, (60, 3)))
+    rows = np.setdiff1d(np.arange(60), np.arange(4, 60, 6))
+    old = map_frames(given.select(rows), adjust=True)
+    new = given.select(np.arange(4, 60, 6))
+    localizer = MapLocalizer(summarize_tracks(old))
+    grown = add_frames(old, given, rows, [localizer.locate(new.query(i)).pose_in_map for i in range(len(new))])
+    assert len(grown.seen) == 60
+    error, given_error = (np.linalg.norm(np.diff(frames.position - training.position, axis=0), axis=1)
+                          for frames in (grown.seen, given))  # fmt: skip
+    assert np.median(error) < 0.3 * np.median(given_error)
+
+
+def test_frames_are_added_to_adjusted_maps_alone(training: MapFrames) -> None:
+    plain = map_frames(training.select(np.arange(20)), adjust=False)
+    with pytest.raises(ValueError, match="after bundle adjustment"):
+        add_frames(plain, training, np.arange(20), [])
 
 
 def test_a_map_stays_small(localizer: MapLocalizer) -> None:

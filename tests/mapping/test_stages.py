@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from lightning_pose.mapping.bundle_adjustment import Adjustment, CameraCorrection, adjust_bundle
 from lightning_pose.mapping.depth_vote import vote_depths
+from lightning_pose.mapping.frames import find_distance_scale
 from lightning_pose.mapping.guided_matching import KeypointMatches, match_pairs
 from lightning_pose.mapping.pairs import choose_pairs, estimate_depth
 from lightning_pose.mapping.point_map import quantize_descriptors
@@ -53,6 +54,20 @@ def test_matches_along_epipolar_lines_are_right() -> None:
     assert set(map(tuple, matches.frame.tolist())) == {(3, 8), (10, 14)}
     assert len(matches.distance) > 100
     assert vote_depths(frames, matches).dtype == bool
+
+
+def test_binary_descriptors_may_differ_more() -> None:
+    """A fifth of the bits of a point differ from view to view: more than real numbers of one point do."""
+    frames = make_frames(*make_walk(30), noise_px=0.2, clutter=0)
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(256, frames.descriptors.shape[2]))
+    bits = np.sign(frames.descriptors @ directions.T) * frames.real[..., None]
+    binary = (bits / 16).astype(np.float32)
+    assert find_distance_scale(binary[0]) > 1
+    assert find_distance_scale(frames.descriptors[0]) == find_distance_scale(np.zeros((0, 8))) == 1
+    pairs = np.array([[3, 8], [10, 14]])
+    found = match_pairs(replace(frames, descriptors=binary), pairs)
+    assert len(found.distance) > 0.8 * len(match_pairs(frames, pairs).distance)
 
 
 def test_padding_is_never_matched() -> None:

@@ -147,7 +147,7 @@ def test_what_takes_no_map_says_why() -> None:
 @pytest.mark.parametrize(
     ("settings", "problem"),
     [
-        ({"keypoints": "SURFACE"}, "keypoints is 'SURFACE'; give one of SURF, SIFT, ORB, FREAK, BRIEF"),
+        ({"keypoints": "SURFACE"}, "keypoints is 'SURFACE'; give one of SURF, SIFT, ORB, AKAZE, FREAK, BRIEF"),
         ({"n_features": 0}, "n_features is 0"),
         ({"bundle_adjust": "no"}, "bundle_adjust is 'no'; give true, false or auto"),
     ],

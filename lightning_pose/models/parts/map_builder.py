@@ -12,13 +12,15 @@ from scipy.spatial.transform import Rotation
 from lightning_pose.data.datamodule import SceneDataModule
 from lightning_pose.errors import ConfigError, DataError
 from lightning_pose.features.base import FeatureExtractor, LocalExtractor
+from lightning_pose.geometry.absolute_pose import CameraPose
 from lightning_pose.geometry.camera import Camera
-from lightning_pose.mapping.build_map import MappedFrames, adjust_mapped, map_frames, summarize_tracks
+from lightning_pose.mapping.build_map import MappedFrames, add_frames, adjust_mapped, map_frames, summarize_tracks
 from lightning_pose.mapping.calibration import UNKNOWN, calibrate_map, measure_frames
 from lightning_pose.mapping.conventions import fit_focal_length
 from lightning_pose.mapping.frame_matches import match_nearby_frames
 from lightning_pose.mapping.frames import MapFrames
 from lightning_pose.mapping.map_localizer import MapLocalizer
+from lightning_pose.mapping.threads import map_in_threads
 from lightning_pose.models.parts.frame_cameras import find_frequent_camera, list_cameras
 from lightning_pose.models.parts.map_network import MapNetwork, keypoints_to_frames
 from lightning_pose.models.parts.world_frame import WorldFrame
@@ -39,7 +41,7 @@ def check_keypoints(extractor: FeatureExtractor) -> None:
     if not isinstance(extractor, LocalExtractor) or not extractor.with_geometry:
         raise ConfigError(
             f"LandmarkMap needs keypoints with their places, and {extractor.name} features have none; "
-            "choose lightning_pose.features.SURF (or SIFT, ORB, FREAK, BRIEF), and set "
+            "choose lightning_pose.features.SURF (or SIFT, ORB, AKAZE, FREAK, BRIEF), and set "
             "data.extractor.with_geometry: true"
         )
 
@@ -70,6 +72,7 @@ class MapBuilder:
         self.say = say
         self._adjusts = bundle_adjust is True
         self._camera: Camera | None = None
+        self._adjusted: MappedFrames | None = None
 
     def build(self, splits: tuple[str, ...], calibrate: bool) -> None:
         """Build the map of the frames of these splits; unless it is only to be validated, find its radii too.
@@ -79,9 +82,12 @@ class MapBuilder:
         """
         camera = self._find_camera()
         frames = self._read_frames(splits, camera)
-        mapped = map_frames(frames, adjust=False)
-        if self.bundle_adjust is not False:
-            mapped = self._choose_adjusted(mapped, camera, decided=splits != ("train",))
+        if splits == ("train",):
+            mapped = self._choose_map(frames, camera)
+        elif self._adjusted is not None:
+            mapped = self._add_validation_frames(self._adjusted, frames, camera)
+        else:
+            mapped = map_frames(frames, self._adjusts)
         if not len(mapped.tracks.points):
             raise DataError(
                 f"no point of {self.datamodule.scene.root} could be triangulated from {len(frames)} frames; "
@@ -98,22 +104,37 @@ class MapBuilder:
                 "(median)"
             )
 
-    def _choose_adjusted(self, mapped: MappedFrames, camera: Camera, decided: bool) -> MappedFrames:
-        """The map after bundle adjustment, or as it was where that locates validation frames better."""
-        if self.bundle_adjust == "auto" and decided and not self._adjusts:
-            return mapped
-        adjusted = adjust_mapped(mapped)
-        if self.bundle_adjust == "auto" and not decided:
+    def _choose_map(self, frames: MapFrames, camera: Camera) -> MappedFrames:
+        """The map of training frames, with bundle adjustment where that locates validation frames better."""
+        plain = map_frames(frames, adjust=False)
+        if self.bundle_adjust is False or not len(plain.tracks.points):
+            return plain
+        adjusted = adjust_mapped(plain)
+        if self.bundle_adjust == "auto":
             if len(self.datamodule.scene.splits["val"]):
                 val = self._read_frames(("val",), camera)
                 before, after = (
                     np.median(measure_frames(MapLocalizer(summarize_tracks(each)), val).position)
-                    for each in (mapped, adjusted)
+                    for each in (plain, adjusted)
                 )
             else:
-                before, after = (calibrate_map(each).position_error for each in (mapped, adjusted))
+                before, after = (calibrate_map(each).position_error for each in (plain, adjusted))
             self._adjusts = bool(after < before)
-        return adjusted if self._adjusts else mapped
+        self._adjusted = adjusted if self._adjusts else None
+        return adjusted if self._adjusts else plain
+
+    def _add_validation_frames(self, mapped: MappedFrames, every: MapFrames, camera: Camera) -> MappedFrames:
+        """The map of training frames with the validation frames added where it locates them."""
+        numbers = [self.datamodule.dataset(split).data.frame.numpy() for split in ("train", "val")]
+        rows = np.searchsorted(np.sort(np.concatenate(numbers)), np.sort(numbers[0]))
+        val = self._read_frames(("val",), camera)
+        localizer = MapLocalizer(summarize_tracks(mapped))
+        answers = map_in_threads(lambda i: localizer.locate(val.query(i)), range(len(val)))
+        poses = [
+            answer.pose_in_map if answer.accepted else localizer.carry_forward(CameraPose(rotation, position))
+            for answer, rotation, position in zip(answers, val.rotation, val.position, strict=True)
+        ]
+        return add_frames(mapped, every, rows, poses)
 
     def _read_frames(self, splits: tuple[str, ...], camera: Camera) -> MapFrames:
         """Keypoints and given poses of the frames of these splits, in the order of the scene.

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from lightning_pose.data.datamodule import SceneDataModule
 from lightning_pose.errors import ConfigError
-from lightning_pose.features import BRIEF, FREAK, ORB, SIFT, SURF, LocalExtractor
+from lightning_pose.features import AKAZE, BRIEF, FREAK, ORB, SIFT, SURF, LocalExtractor
 from lightning_pose.mapping.map_localizer import MapAnswer
 from lightning_pose.models.parts.frame_cameras import list_cameras
 from lightning_pose.models.parts.map_builder import BundleAdjust, MapBuilder, check_bundle_adjust
@@ -20,10 +20,10 @@ from lightning_pose.models.parts.world_frame import WorldFrame
 
 __all__ = ["MapRefinement", "MapSettings"]
 
-Keypoints = Literal["SURF", "SIFT", "ORB", "FREAK", "BRIEF"]
+Keypoints = Literal["SURF", "SIFT", "ORB", "AKAZE", "FREAK", "BRIEF"]
 
 EXTRACTORS: dict[Keypoints, type[LocalExtractor]] = {
-    "SURF": SURF, "SIFT": SIFT, "ORB": ORB, "FREAK": FREAK, "BRIEF": BRIEF,
+    "SURF": SURF, "SIFT": SIFT, "ORB": ORB, "AKAZE": AKAZE, "FREAK": FREAK, "BRIEF": BRIEF,
 }  # fmt: skip
 
 
