@@ -27,6 +27,18 @@ def write(root: Path, image_times: list[float], rows: list[str]) -> Path:
     return root
 
 
+@pytest.mark.parametrize(
+    ("name", "fx"),
+    [("fr1_rpy", 517.3), ("fr2-desk", 520.9), ("rgbd_dataset_freiburg3_office", 535.4), ("fr10", None), ("afr1", None)],
+)
+def test_the_folder_names_the_camera(name: str, fx: float | None, tmp_path: Path) -> None:
+    scene = load_scene(
+        write(tmp_path / name, [100.0, 100.1, 100.2], [f"{t} 0 0 0 0 0 0 1" for t in (100.0, 100.1, 100.2)])
+    )
+    intrinsics = scene.frames[0].intrinsics
+    assert (intrinsics and intrinsics.fx) == fx
+
+
 def test_pose_and_order_of_the_quaternion(tmp_path: Path) -> None:
     root = tmp_path / "rgbd_dataset_freiburg1_desk"
     rows = ["100.1 4 5 6 0 0 0 1", "100.004 1 2 3 0.1 0.1 0.7 0.7", "100.2 0 0 0 0 0 0 -1"]
