@@ -49,7 +49,7 @@ def main() -> None:
     truths = find_truths(args)
     rows = [measure_extractor(name, args.root, truth, args.pgt) for name in args.only for truth in truths]
     head = [
-        "keypoints", "ground truth", "m / deg", "5 cm", "accepted", "adjustment", "points", "checkpoint MB", "fit, CPU s",
+        "keypoints", "ground truth", "m / deg", "5 cm", "accepted", "adjustment", "points", "checkpoint MB", "fit s",
     ]  # fmt: skip
     print_table(head, rows)
 

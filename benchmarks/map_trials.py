@@ -7,21 +7,32 @@ import logging
 import time
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from lightning import Trainer, seed_everything
 
 from lightning_pose.data import ImageDataModule
+from lightning_pose.data.batches import PoseBatch
 from lightning_pose.features import SURF, FeatureExtractor
 from lightning_pose.geometry.quaternions import orientation_error_deg, position_error_m
 from lightning_pose.mapping.map_localizer import MapAnswer
-from lightning_pose.models import LandmarkMap, PoseModule
+from lightning_pose.models import LandmarkMap, Pose, PoseModule
 from lightning_pose.models.parts.answers import convert_answers
 from lightning_pose.models.parts.frame_cameras import list_cameras
 
-__all__ = ["Errors", "FittedMap", "add_scene_arguments", "find_truths", "fit_map", "load_scene", "print_table", "train"]
+__all__ = [
+    "Errors",
+    "FittedMap",
+    "add_scene_arguments",
+    "find_truths",
+    "fit_map",
+    "load_scene",
+    "measure_poses",
+    "print_table",
+    "train",
+]
 
 
 @dataclass(frozen=True)
@@ -30,7 +41,11 @@ class Errors:
 
     position_m: np.ndarray
     orientation_deg: np.ndarray
-    accepted: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
+    accepted: np.ndarray
+
+    def select(self, kept: np.ndarray) -> Errors:
+        """Those under a mask."""
+        return Errors(self.position_m[kept], self.orientation_deg[kept], self.accepted[kept])
 
     @property
     def medians(self) -> str:
@@ -39,6 +54,15 @@ class Errors:
     @property
     def within_5cm(self) -> str:
         return f"{np.mean((self.position_m <= 0.05) & (self.orientation_deg <= 5)):.0%}"
+
+
+def measure_poses(pose: Pose, truth: PoseBatch, answers: Sequence[MapAnswer]) -> Errors:
+    """Errors of N poses in the world, which may come from the map's answers."""
+    return Errors(
+        position_error_m(pose.position_m.double(), truth.position_m.double()).numpy(),
+        orientation_error_deg(pose.quat_wxyz.double(), truth.quat_wxyz.double()).numpy(),
+        np.array([answer.accepted for answer in answers]),
+    )
 
 
 @dataclass(frozen=True)
@@ -59,13 +83,7 @@ class FittedMap:
 
     def measure(self, answers: Sequence[MapAnswer], split: str = "test") -> Errors:
         """Errors of answers for the frames of a split."""
-        frames = self.data.dataset(split).data
-        pose = convert_answers(answers, self.module.world_frame)
-        return Errors(
-            position_error_m(pose.position_m, frames.position_m.double()).numpy(),
-            orientation_error_deg(pose.quat_wxyz, frames.quat_wxyz.double()).numpy(),
-            np.array([answer.accepted for answer in answers]),
-        )
+        return measure_poses(convert_answers(answers, self.module.world_frame), self.data.dataset(split).data, answers)
 
     @property
     def adjusted(self) -> bool:
