@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import argparse
 import logging
+import re
 import time
 import warnings
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -119,6 +121,12 @@ def fit_map(data: ImageDataModule, bundle_adjust: bool | str = "auto", refit: bo
     """As `fit --config configs/landmark_map.yaml` does."""
     module = LandmarkMap(input_shape=list(data.input_shape), bundle_adjust=bundle_adjust, refit=refit)  # type: ignore[arg-type]
     return FittedMap(module, data, train(module, data))
+
+
+def list_reasons(answers: Sequence[MapAnswer]) -> str:
+    """Why answers are refused, with counts."""
+    reasons = Counter(re.split(r"[:\d]", answer.reason)[0].strip() for answer in answers if not answer.accepted)
+    return ", ".join(f"{count} {reason}" for reason, count in reasons.most_common()) or "-"
 
 
 def make_trainer() -> Trainer:

@@ -11,14 +11,21 @@ from __future__ import annotations
 import argparse
 import contextlib
 import io
-import re
-from collections import Counter
 from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
 import torch
-from map_trials import Errors, FittedMap, add_scene_arguments, find_truths, fit_map, load_scene, print_table
+from map_trials import (
+    Errors,
+    FittedMap,
+    add_scene_arguments,
+    find_truths,
+    fit_map,
+    list_reasons,
+    load_scene,
+    print_table,
+)
 from scipy.spatial.transform import Rotation
 from scipy.stats import rankdata
 
@@ -77,12 +84,6 @@ def rank_test_first(test: Sequence[float], others: Sequence[float]) -> float:
     """Area under the ROC curve: the share of pairs in which the test frame has more, equal ones counted half."""
     ranks = rankdata(np.concatenate([test, others]))[: len(test)]
     return float((ranks.sum() - len(test) * (len(test) + 1) / 2) / (len(test) * len(others)))
-
-
-def list_reasons(answers: Sequence[MapAnswer]) -> str:
-    """Why answers are refused, with counts."""
-    reasons = Counter(re.split(r"[:\d]", answer.reason)[0].strip() for answer in answers if not answer.accepted)
-    return ", ".join(f"{count} {reason}" for reason, count in reasons.most_common()) or "-"
 
 
 def make_row(name: str, answers: Sequence[MapAnswer], test: Sequence[MapAnswer], errors: Errors | None) -> list[object]:
