@@ -22,6 +22,7 @@ import yaml
 from map_trials import add_scene_arguments, find_truths, load_scene, measure_poses, print_table, train
 
 from lightning_pose.data import ImageDataModule
+from lightning_pose.data.batches import PoseBatch
 from lightning_pose.evaluation.baselines.images import evaluate_baselines
 from lightning_pose.features import CNN
 from lightning_pose.features.base import FeatureExtractor
@@ -110,14 +111,18 @@ def ask(
     }
     errors = {name: measure_poses(pose, test, answers) for name, pose in poses.items()}
     learnt = [data.dataset(split).data for split in ("train", "val")]
-    known = [torch.cat([getattr(part, name) for part in learnt]) for name in ("features", "position_m", "quat_wxyz")]
-    top = evaluate_baselines(*known, features, test.position_m, test.quat_wxyz)["retrieval_top1"].metrics
+    known = PoseBatch(*(torch.cat(tensors) for tensors in zip(*learnt, strict=True)))
+    top = evaluate_baselines(
+        known.features, known.position_m, known.quat_wxyz, features, test.position_m, test.quat_wxyz
+    )["retrieval_top1"].metrics
     accepted = errors["refined"].accepted
     row: Row = [case, truth, f"{top['position_median_m']:.3f} / {top['orientation_median_deg']:.1f}"]
     row += [errors["regressor alone"].medians, errors["refined"].medians, errors["refined"].within_5cm]
     row += [errors["map alone"].medians, errors["map alone"].within_5cm, f"{accepted.mean():.0%}"]
     row.append(errors["refined"].select(accepted).medians if accepted.any() else "-")
-    details = [[case, truth, name, *list_metrics(of.position_m, of.orientation_deg)] for name, of in errors.items()]
+    details: list[Row] = [
+        [case, truth, name, *list_metrics(of.position_m, of.orientation_deg)] for name, of in errors.items()
+    ]
     return row, details
 
 

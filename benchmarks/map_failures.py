@@ -72,7 +72,7 @@ class TestFrames:
         other = np.array([place.get(frame.image, np.full(3, np.nan)) for frame in fitted.data.scene.frames])
         known = np.isfinite(other[:, 0])
         ours, theirs = self.position[known], other[known]
-        turn, _ = Rotation.align_vectors(ours - ours.mean(0), theirs - theirs.mean(0))
+        turn = Rotation.align_vectors(ours - ours.mean(0), theirs - theirs.mean(0))[0]
         off = np.full_like(other, np.nan)
         moved = turn.apply(theirs - theirs.mean(0)) + ours.mean(0) - ours
         off[known] = np.einsum("fji,fj->fi", self.rotation[known], moved)

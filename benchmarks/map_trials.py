@@ -90,8 +90,8 @@ class FittedMap:
     @property
     def adjusted(self) -> bool:
         """Whether bundle adjustment has moved the training poses."""
-        network = self.module.network
-        return not torch.equal(network.position, network.given_position)
+        point_map = self.module.network.point_map
+        return not np.array_equal(point_map.position, point_map.given_position)
 
 
 def load_scene(

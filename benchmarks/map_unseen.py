@@ -1,6 +1,6 @@
 """What a landmark map says of images that it must refuse (another scene, blank, mirrored), and of spoiled test frames.
 
-    python benchmarks/map_unseen.py --root DIR --other DIR [--pgt DIR] [--n_features 300]
+    python benchmarks/map_unseen.py --root DIR --other DIR [--other_camera CAMERA] [--pgt DIR] [--n_features 300]
 
 AUROC: how often a random test frame has more inliers than a random image of the row. About 3 CPU minutes on the kitchen
 cut with the office as the other scene, whose features are cached.
@@ -100,9 +100,9 @@ def make_row(name: str, answers: Sequence[MapAnswer], test: Sequence[MapAnswer],
     return [name, f"{accepted.sum()} of {len(answers)}", error, false, most, *auroc, list_reasons(answers)]
 
 
-def ask_other(fitted: FittedMap, root: str, surf: SURF) -> list[MapAnswer]:
+def ask_other(fitted: FittedMap, root: str, camera: str | None, surf: SURF) -> list[MapAnswer]:
     """The map's answers for all frames of another scene, each with its own camera, or the map's."""
-    other = load_scene(root, extractor=surf)
+    other = load_scene(root, extractor=surf, camera=camera)
     other.fill()
     frames = list(range(len(other.scene.frames)))
     return fitted.module.network.locate(
@@ -132,6 +132,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add_scene_arguments(parser)
     parser.add_argument("--other", required=True, help="the folder of another scene")
+    parser.add_argument("--other_camera", help="its camera, as data.camera has it, where the scene has none")
     parser.add_argument("--n_features", type=int, default=300)
     args = parser.parse_args()
     for truth in find_truths(args):
@@ -140,7 +141,7 @@ def main() -> None:
             fitted = fit_map(load_scene(args.root, truth, args.pgt, surf))
         test = fitted.locate()
         rows = [make_row("test frames", test, test, fitted.measure(test))]
-        rows.append(make_row("the other scene", ask_other(fitted, args.other, surf), test, None))
+        rows.append(make_row("the other scene", ask_other(fitted, args.other, args.other_camera, surf), test, None))
         for name, change in CHANGES.items():
             answers = ask_changed(fitted, surf, change)
             errors = measure_upside_down(fitted, answers) if name == "upside down" else fitted.measure(answers)
