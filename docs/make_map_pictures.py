@@ -235,11 +235,13 @@ def draw_inliers(stage: Stage, localizer: MapLocalizer, answers: Sequence[MapAns
     for blur_px in BLURS_PX:
         blurred = np.asarray(cv2.GaussianBlur(sharp, (0, 0), blur_px))
         answer = locate_image(stage, localizer, blurred)
-        if not answer.accepted and answer.shown is not None:
+        if not answer.accepted:
             images.append(_show_answer(stage, blurred, answer, f"blurred by {blur_px:g} px"))
             break
     figure = draw_matched_images(images, "Points of the map in an image")
     figure.set_size_inches(9.5, 4.3)
+    if not len(images[-1].seen) and (legend := figure.axes[-1].get_legend()) is not None:
+        legend.remove()  # refused before a pose was found that would put points into the image
     return figure
 
 
@@ -251,11 +253,12 @@ def locate_image(stage: Stage, localizer: MapLocalizer, pixels: np.ndarray) -> M
 
 
 def _show_answer(stage: Stage, pixels: np.ndarray, answer: MapAnswer, caption: str) -> MatchedImage:
-    shown = answer.shown
-    assert shown is not None, "chosen for it"
-    seen, projected, observed = (stage.camera.project(each) for each in shown[:3])
-    reason = answer.reason or f"accepted with {answer.inliers} inliers"
-    return MatchedImage(pixels, seen, projected, observed, shown.inlier, f"{caption}: {reason}")
+    caption = f"{caption}: {answer.reason or f'accepted with {answer.inliers} inliers'}"
+    if answer.shown is None:
+        nothing = np.zeros((0, 2))
+        return MatchedImage(pixels, nothing, nothing, nothing, np.zeros(0, bool), caption)
+    seen, projected, observed = (stage.camera.project(each) for each in answer.shown[:3])
+    return MatchedImage(pixels, seen, projected, observed, answer.shown.inlier, caption)
 
 
 def draw_radii(stage: Stage, answers: Sequence[MapAnswer], factors: tuple[float, float]) -> Figure:
