@@ -6,7 +6,7 @@ import re
 
 import griffe
 
-EXAMPLE = re.compile(r"(?m)^>>> .*(?:\n\S.*)*")
+EXAMPLE = re.compile(r"(?m)^>>> .*(?:\n.+)*")
 
 
 class DoctestBlocks(griffe.Extension):
