@@ -100,7 +100,7 @@ class MapNetwork(nn.Module):
         device = self.calibration.device
         for field in fields(point_map):
             kind = MAP_SHAPES[field.name][1]
-            setattr(self, field.name, torch.from_numpy(getattr(point_map, field.name)).to(device, kind))
+            getattr(self, field.name).data = torch.from_numpy(getattr(point_map, field.name)).to(device, kind)
         numbers = [camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, camera.fisheye]
         numbers += [*camera.distortion, *[0.0] * (8 - len(camera.distortion))]
         self.camera_numbers = torch.tensor(numbers, dtype=torch.float64, device=device)
@@ -111,7 +111,7 @@ class MapNetwork(nn.Module):
     @property
     def point_map(self) -> PointMap:
         """The map; empty before `fit`."""
-        return PointMap(**{name: getattr(self, name).cpu().numpy() for name in MAP_SHAPES})
+        return PointMap(**{name: getattr(self, name).detach().cpu().numpy() for name in MAP_SHAPES})
 
     @property
     def view(self) -> Camera:
