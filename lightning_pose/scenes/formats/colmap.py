@@ -30,10 +30,11 @@ FOLDERS = ("", "sparse", "sparse/0", "colmap/sparse/0", "colmap/sparse", "dense/
 MODEL_IDS = (
     "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",
     "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE",
+    "SIMPLE_DIVISION", "DIVISION", "SIMPLE_FISHEYE", "FISHEYE", "EUCM", "EQUIRECTANGULAR",
 )  # fmt: skip
 """COLMAP's camera models by their numbers in binary files."""
 
-OTHER_PARAMETERS = {"FOV": 5, "THIN_PRISM_FISHEYE": 12, "RAD_TAN_THIN_PRISM_FISHEYE": 16}
+OTHER_PARAMETERS = {"SIMPLE_DIVISION": 4, "DIVISION": 5, "EUCM": 6, "EQUIRECTANGULAR": 2}
 """How many parameters the models have whose distortion is not read."""
 
 
