@@ -13,11 +13,11 @@ from starlette.exceptions import HTTPException
 
 from lightning_pose import __version__
 from lightning_pose.errors import PoseError
+from lightning_pose.localization.picture_head import NotAnImageError, TooManyPixelsError, check_head
 from lightning_pose.serving.api_page import render_api_page
 from lightning_pose.serving.errors import RequestError, error_response
 from lightning_pose.serving.guards import Guard
 from lightning_pose.serving.limits import Limits
-from lightning_pose.serving.pictures import check_picture
 from lightning_pose.serving.schemas import LOCALIZE, describe_answer
 from lightning_pose.serving.service import Json, Service
 from lightning_pose.serving.uploads import RequestBody, Upload
@@ -92,9 +92,13 @@ def create_app(service: Service, limits: Limits, hosts: Iterable[str] = ()) -> F
 
 def _locate(service: Service, upload: Upload, limits: Limits) -> Json:
     """The pose of an upload, on a thread of the pool."""
-    check_picture(upload.image, limits.max_pixels)
     try:
+        check_head(upload.image, limits.max_pixels)
         return service.locate(upload)
+    except TooManyPixelsError as error:
+        raise RequestError(413, "too_many_pixels", str(error)) from error
+    except NotAnImageError as error:
+        raise RequestError(415, "not_an_image", str(error)) from error
     except PoseError as error:
         raise RequestError(422, "unusable", str(error)) from error
 

@@ -6,6 +6,7 @@ import os
 from dataclasses import dataclass
 
 from lightning_pose.errors import ConfigError
+from lightning_pose.localization.picture_head import MAX_PIXELS
 
 __all__ = ["Limits"]
 
@@ -29,7 +30,7 @@ class Limits:
     """
 
     max_megabytes: float = 20.0
-    max_pixels: int = 25_000_000
+    max_pixels: int = MAX_PIXELS
     timeout_s: float = 30.0
     threads: int = os.cpu_count() or 1
     waiting: int = 64
