@@ -14,10 +14,10 @@ __all__ = ["main"]
 
 DESCRIPTION = """Answer images with poses over HTTP.
 
-MODEL is a checkpoint that fit wrote, an MLflow run's id, a registered model such as models:/kitchen@champion, or a folder
-that export wrote. POST an image to /localize; / is a page to try it, /docs lists all addresses.
+MODEL is a checkpoint that fit wrote, an MLflow run's id, a registered model such as models:/kitchen@champion, or a
+folder that export wrote. POST an image to /localize; / is a page to try it, /docs lists all addresses.
 
-The server has no encryption and asks for no password. By default only programs and browsers of this machine reach it."""
+The server has no encryption and asks for no password. By default only this machine's programs and browsers reach it."""
 
 EPILOG = """examples:
   python -m lightning_pose serve mlruns/checkpoints/RUN_ID/best.ckpt

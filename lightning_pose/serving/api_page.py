@@ -14,6 +14,7 @@ PAGE = """<!doctype html>
 <meta name="viewport" content="width=device-width">
 <title>{title}: addresses</title>
 <link rel="stylesheet" href="page.css">
+<link rel="icon" href="icon.svg">
 <main>
 <h1>{title} {version}</h1>
 <p>{summary} The same as <a href="openapi.json">openapi.json</a>; <a href="./">try it</a>.</p>

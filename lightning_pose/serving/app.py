@@ -25,7 +25,7 @@ from lightning_pose.serving.workers import WorkerPool
 
 __all__ = ["create_app"]
 
-STATIC = {"page.html": "text/html", "page.js": "text/javascript", "page.css": "text/css"}
+STATIC = {"page.html": "text/html", "page.js": "text/javascript", "page.css": "text/css", "icon.svg": "image/svg+xml"}
 
 
 def create_app(service: Service, limits: Limits, hosts: Iterable[str] = ()) -> FastAPI:

@@ -51,7 +51,7 @@ def page() -> Iterator[Page]:
     rng = np.random.default_rng(0)
     points = rng.uniform([0, 0, 0], [4, 2, 4], (300, 3))
     position = np.stack([np.linspace(1, 3, 9), np.ones(9), np.full(9, 0.5)], axis=1)
-    model = {"architecture": "LandmarkMap", "scene": "<b>room</b>", "unit": "m", "version": "0"}
+    model = {"architecture": "LandmarkMap", "scene": "<b>room</b>", "version": "0"}
     service = Service(locate, model, view_from_above(points, np.tile(np.eye(3), (9, 1, 1)), position))
     with serve(service) as server, browser.open_page(server.address, width=1100, height=800) as opened:
         messages: list[str] = []
@@ -78,7 +78,7 @@ def test_a_dropped_picture_appears_in_the_map(page: Page) -> None:
     place = page.locator("#map g.accepted")
     # x is to the right; y is down, so that z is up on the page
     assert [float(place.get_attribute(name) or "") for name in ("data-x", "data-y")] == pytest.approx([2.0, -1.0])
-    assert "2.000, 1.500, -1.000 m" in page.locator("#answer").inner_text()
+    assert "2.000, 1.500, -1.000" in page.locator("#answer").inner_text()
     assert "40 of 90 visible points" in page.locator("#answer").inner_text()
     frame, radius = page.locator("#map").bounding_box(), page.locator("#map .radius").bounding_box()
     assert frame is not None

@@ -5,7 +5,6 @@ const SVG = "http://www.w3.org/2000/svg";
 const byId = (id) => document.getElementById(id);
 const earlier = []; // places of earlier answers, in the plane
 let view = null; // of /map; null where the system has no map
-let unit = "m";
 let asked = 0; // number of the last question, so that a late answer does not replace a newer one
 
 function shape(parent, name, attributes, text) {
@@ -41,7 +40,7 @@ function drawScale(svg, scale, height) {
   const wanted = 120 / scale, step = 10 ** Math.floor(Math.log10(wanted));
   const length = [5, 2, 1].map((factor) => factor * step).find((value) => value <= wanted) || step;
   shape(svg, "path", { class: "scale", d: `M12,${height - 14} h${length * scale}` });
-  shape(svg, "text", { x: 12, y: height - 20 }, `${Number(length.toPrecision(2))} ${unit}`);
+  shape(svg, "text", { x: 12, y: height - 20 }, String(Number(length.toPrecision(2))));
 }
 
 function draw(pose) {
@@ -55,7 +54,8 @@ function draw(pose) {
   const box = [...view.box];
   const place = pose && project(pose.position_m);
   if (place) { // an answer outside the map is drawn, too
-    const margin = 0.05 * Math.max(box[2] - box[0], box[3] - box[1]);
+    const extent = Math.max(box[2] - box[0], box[3] - box[1]);
+    const margin = Math.min(Math.max(0.05 * extent, 1.1 * (pose.radius_m || 0)), extent);
     for (const axis of [0, 1]) {
       box[axis] = Math.min(box[axis], place[axis] - margin);
       box[axis + 2] = Math.max(box[axis + 2], place[axis] + margin);
@@ -80,13 +80,13 @@ function draw(pose) {
 }
 
 const digits = (values, count) => values.map((value) => value.toFixed(count)).join(", ");
-const known = (value, count, name) => (value === null ? "unknown" : `${value.toFixed(count)} ${name}`);
+const known = (value, count, name) => (value === null ? "unknown" : `${value.toFixed(count)} ${name}`.trim());
 
 function showAnswer(pose) {
   const rows = [
-    ["position", `${digits(pose.position_m, 3)} ${unit}`],
+    ["position", digits(pose.position_m, 3)],
     ["quaternion wxyz", digits(pose.quat_wxyz, 4)],
-    ["90 % within", `${known(pose.radius_m, 3, unit)}, ${known(pose.radius_deg, 2, "degrees")}`],
+    ["90 % within", `${known(pose.radius_m, 3, "")}, ${known(pose.radius_deg, 2, "degrees")}`],
     ["source", pose.source],
     ["inliers", pose.inliers === null ? "no map" : `${pose.inliers} of ${pose.visible} visible points`],
     ["time", known(pose.milliseconds.total ?? null, 0, "ms")],
@@ -158,7 +158,6 @@ function listen() {
 async function start() {
   listen();
   const model = await (await fetch("model")).json();
-  unit = model.unit || unit;
   byId("model").textContent = ["architecture", "scene", "ground_truth", "camera", "version"]
     .filter((name) => model[name]).map((name) => `${name.replace("_", " ")} ${model[name]}`).join(" · ");
   const answer = await fetch("map");
