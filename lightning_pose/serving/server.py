@@ -66,6 +66,8 @@ def bind_socket(host: str, port: int) -> socket.socket:
     Raises:
         ConfigError: the address cannot be used.
     """
+    if not 0 <= port < 1 << 16:
+        raise ConfigError(f"--port is {port}; give 0 to 65535")
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(
             host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
@@ -73,8 +75,9 @@ def bind_socket(host: str, port: int) -> socket.socket:
         listener = socket.socket(family, kind, protocol)
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind(address)
-    except (OSError, OverflowError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
+        listener.listen()  # here, where a port that is taken is one line
+    except OSError as error:
+        reason = error.strerror or str(error)
         raise ConfigError(f"--host {host} --port {port} cannot be used ({reason}); give another") from error
     return listener
 
