@@ -15,6 +15,7 @@ import pytest
 from lightning_pose.localization.localizer import Localizer
 from lightning_pose.localization.located_pose import LocatedPose
 from lightning_pose.scenes.formats import load_scene
+from lightning_pose.scenes.images import read_rgb
 from tests.helpers import REPOSITORY
 
 NODE, BAGS = re.findall(r"```python\n(.*?)```", (REPOSITORY / "docs" / "robots.md").read_text(), re.DOTALL)
@@ -89,7 +90,7 @@ def test_a_bag_becomes_a_dataset(bag: Path, code: dict[str, Any], tmp_path: Path
     np.testing.assert_allclose([frame.position_m for frame in scene.frames], [[0, 2, 3], [1, 2, 3], [2, 2, 3]])
     np.testing.assert_allclose([frame.quat_wxyz for frame in scene.frames], [[0.8, 0, 0, 0.6]] * 3)
     assert [frame.timestamp for frame in scene.frames] == pytest.approx([0, 0.1, 0.2])
-    assert np.array_equal(cv2.imread(str(scene.frames[1].image))[..., ::-1], make_picture(1))
+    assert np.array_equal(read_rgb(scene.frames[1].image), make_picture(1))
 
 
 class StandIn:

@@ -46,34 +46,44 @@ def load_service(source: str | Path, allow: Iterable[str] = ()) -> Service:
         pose = localizer.localize(upload.image, upload.camera, parse_prior(upload.prior))
         return replace(pose, image=upload.name).to_dict()
 
-    return Service(locate, _describe_model(localizer, source), _draw_map(localizer))
+    return Service(locate, _describe_model(localizer, source), _draw_map(localizer, source))
 
 
 def _describe_model(localizer: Localizer, source: str | Path) -> Json:
     """What `/model` says; names of folders, but not where they are."""
     system = localizer.system
     view = system.view
-    facts: dict[str, object] = {
-        "architecture": system.name,
-        "camera": None if view is None else str(view),
-        "reads": system.color,
-        "version": __version__,
-    }
-    if not Path(source).is_file():
-        return facts
-    data = read_checkpoint(source)["lightning_pose"]["data"]["init_args"]
+    facts = {"architecture": system.name, "camera": None if view is None else str(view), "reads": system.color}
+    told = _read_exported(source) if Path(source).is_dir() else _read_checkpoint(source)
+    return {**facts, **told, "version": __version__}
+
+
+def _read_exported(folder: str | Path) -> Json:
+    """The ground truth that an exported folder names."""
+    return {"ground_truth": json.loads((Path(folder) / EXPORTED_FILE).read_text("utf-8")).get("ground_truth")}
+
+
+def _read_checkpoint(source: str | Path) -> Json:
+    """Scene, ground truth and features that a checkpoint names."""
+    data = read_checkpoint(find_checkpoint(source))["lightning_pose"]["data"]["init_args"]
     scenes = data.get("train_scenes") or [data.get("root")]
-    facts["scene"] = ", ".join(Path(str(scene)).name for scene in scenes if scene) or "synthetic room"
-    facts["ground_truth"] = data.get("ground_truth")
-    facts["features"] = data["extractor"]["class_path"].rpartition(".")[2]
-    return facts
+    return {
+        "scene": ", ".join(Path(str(scene)).name for scene in scenes if scene) or "synthetic room",
+        "ground_truth": data.get("ground_truth"),
+        "features": data["extractor"]["class_path"].rpartition(".")[2],
+    }
 
 
-def _draw_map(localizer: Localizer) -> Json | None:
-    """The map from above; None without a map."""
-    network = localizer.system.model.map_network if isinstance(localizer.system, TrainedSystem) else None
+def _draw_map(localizer: Localizer, source: str | Path) -> Json | None:
+    """The map from above; None without a map, and for exported folders."""
+    if Path(source).is_dir():
+        return None
+    from lightning_pose.localization.trained_system import TrainedSystem  # torch, which exported folders do without
+
+    system = localizer.system
+    network = system.model.map_network if isinstance(system, TrainedSystem) else None
     if network is None or not len(network.position):
         return None
-    to_world = localizer.system.model.world_frame.to_world
-    points, position = (to_world(array.cpu()).numpy() for array in (network.points, network.position))
-    return view_from_above(points, network.point_map.rotation, position)
+    point_map, to_world = network.point_map, system.model.world_frame.to_world
+    points, position = (to_world(torch.from_numpy(array)).numpy() for array in (point_map.points, point_map.position))
+    return view_from_above(points, point_map.rotation, position)

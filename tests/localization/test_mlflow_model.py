@@ -55,6 +55,7 @@ def test_a_row_for_each_image(model: PyFuncModel, trained: Trained, images: list
 def test_the_model_says_what_it_takes_and_carries_this_package(model: PyFuncModel, trained: Trained) -> None:
     assert model.metadata.flavors["python_function"]["code"] == "code"
     schema = model.metadata.get_input_schema()
+    assert schema is not None
     assert [(spec.name, spec.type.name, spec.required) for spec in schema.inputs] == [
         ("image", "binary", True),
         ("camera", "string", False),
