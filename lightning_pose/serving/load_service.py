@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from safetensors.numpy import load_file
 
 from lightning_pose import __version__
-from lightning_pose.checkpoint import read_checkpoint
 from lightning_pose.errors import ConfigError
+from lightning_pose.localization.load_source import EXPORTED_FILE, find_checkpoint
 from lightning_pose.localization.localizer import Localizer
 from lightning_pose.localization.prior_text import parse_prior
-from lightning_pose.localization.trained_system import TrainedSystem
 from lightning_pose.serving.map_view import view_from_above
 from lightning_pose.serving.service import Json, Service
 from lightning_pose.serving.uploads import Upload
@@ -54,17 +55,20 @@ def _describe_model(localizer: Localizer, source: str | Path) -> Json:
     system = localizer.system
     view = system.view
     facts = {"architecture": system.name, "camera": None if view is None else str(view), "reads": system.color}
-    told = _read_exported(source) if Path(source).is_dir() else _read_checkpoint(source)
-    return {**facts, **told, "version": __version__}
+    more = _read_exported(source) if Path(source).is_dir() else _read_checkpoint(source)
+    return {**facts, **more, "version": __version__}
 
 
 def _read_exported(folder: str | Path) -> Json:
-    """The ground truth that an exported folder names."""
-    return {"ground_truth": json.loads((Path(folder) / EXPORTED_FILE).read_text("utf-8")).get("ground_truth")}
+    """What an exported folder says of its training."""
+    facts = json.loads((Path(folder) / EXPORTED_FILE).read_text("utf-8"))
+    return {name: facts.get(name) for name in ("scene", "ground_truth")}
 
 
 def _read_checkpoint(source: str | Path) -> Json:
     """Scene, ground truth and features that a checkpoint names."""
+    from lightning_pose.checkpoint import read_checkpoint  # torch, which exported folders do without
+
     data = read_checkpoint(find_checkpoint(source))["lightning_pose"]["data"]["init_args"]
     scenes = data.get("train_scenes") or [data.get("root")]
     return {
@@ -75,15 +79,30 @@ def _read_checkpoint(source: str | Path) -> Json:
 
 
 def _draw_map(localizer: Localizer, source: str | Path) -> Json | None:
-    """The map from above; None without a map, and for exported folders."""
-    if Path(source).is_dir():
+    """The map from above; None without a map."""
+    points = localizer.system.read_map_points()
+    if points is None or not len(points):
         return None
-    from lightning_pose.localization.trained_system import TrainedSystem  # torch, which exported folders do without
+    rotation, position = _read_exported_cameras(Path(source)) if Path(source).is_dir() else _read_cameras(localizer)
+    return view_from_above(points, rotation, position)
+
+
+def _read_cameras(localizer: Localizer) -> tuple[np.ndarray, np.ndarray]:
+    """(F, 3, 3) and (F, 3) of a checkpoint's training cameras in the world."""
+    import torch
+
+    from lightning_pose.localization.trained_system import TrainedSystem
 
     system = localizer.system
-    network = system.model.map_network if isinstance(system, TrainedSystem) else None
-    if network is None or not len(network.position):
-        return None
-    point_map, to_world = network.point_map, system.model.world_frame.to_world
-    points, position = (to_world(torch.from_numpy(array)).numpy() for array in (point_map.points, point_map.position))
-    return view_from_above(points, point_map.rotation, position)
+    assert isinstance(system, TrainedSystem)
+    network = system.model.map_network
+    assert network is not None
+    point_map = network.point_map
+    return point_map.rotation, system.model.world_frame.to_world(torch.from_numpy(point_map.position)).numpy()
+
+
+def _read_exported_cameras(folder: Path) -> tuple[np.ndarray, np.ndarray]:
+    """The same of an exported folder."""
+    facts = json.loads((folder / EXPORTED_FILE).read_text("utf-8"))
+    arrays, world = load_file(folder / facts["map"]["file"]), facts["world"]
+    return arrays["rotation"], np.array(world["origin"]) + world["scale"] * arrays["position"]
