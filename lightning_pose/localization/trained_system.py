@@ -94,7 +94,11 @@ class TrainedSystem:
     def read_map_points(self) -> np.ndarray | None:
         """(P, 3) points of the map in the world, in the scene's unit; None without a map."""
         network = self.model.map_network
-        return None if network is None else self.model.world_frame.to_world(torch.from_numpy(network.point_map.points)).numpy()
+        return (
+            None
+            if network is None
+            else self.model.world_frame.to_world(torch.from_numpy(network.point_map.points)).numpy()
+        )
 
     def locate(self, image: LoadedImage, camera: Camera | None = None, prior: CameraPose | None = None) -> LocatedPose:
         """Locate one image, as it is.
