@@ -71,8 +71,8 @@ def _build_parser() -> VerbParser:
         "--every",
         metavar="N",
         type=_parse_count,
-        help="choose the sharpest of each N frames; 1 takes all (default: one for each 4 %% of the image's width by "
-        "which the image moves)",
+        help="choose the sharpest of each N frames; 1 takes all (default: one for each 3 %% of the image's width by "
+        "which the image moves; all of a folder with up to 200 images)",
     )
     parser.add_argument(
         "--camera",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,6 +10,7 @@ import numpy as np
 import pycolmap
 
 from lightning_pose.geometry.similarity import Similarity
+from lightning_pose.reconstruction.agreement import MatchedPair
 
 __all__ = ["SharedPoints", "add_piece", "find_shared_points", "join_pieces", "polish"]
 
@@ -42,15 +43,14 @@ class SharedPoints(NamedTuple):
 def find_shared_points(
     base: pycolmap.Reconstruction,
     piece: pycolmap.Reconstruction,
-    pairs: Iterable[tuple[int, int, np.ndarray]],
+    pairs: Sequence[MatchedPair],
 ) -> SharedPoints:
     """Points of two models that are one, by matches of an image of one with an image of the other.
 
     Args:
         base: the one model.
         piece: the other.
-        pairs: numbers of two images, and (K, 2) rows of their keypoints that match. An image that both models have
-            matches itself without being listed.
+        pairs: the matches. An image that both models have matches itself without being listed.
     """
     point_of_base, point_of_piece = (_list_point_numbers(model) for model in (base, piece))
     both = sorted(set(point_of_base) & set(point_of_piece))
@@ -133,7 +133,7 @@ def add_piece(base: pycolmap.Reconstruction, piece: pycolmap.Reconstruction, fou
 
 
 def join_pieces(
-    models: Sequence[pycolmap.Reconstruction], pairs: Sequence[tuple[int, int, np.ndarray]]
+    models: Sequence[pycolmap.Reconstruction], pairs: Sequence[MatchedPair]
 ) -> list[pycolmap.Reconstruction]:
     """Add to the largest model the poses of each other one that lies to it in one way.
 
