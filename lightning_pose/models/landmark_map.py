@@ -7,7 +7,7 @@ from typing import Any, ClassVar, cast
 
 import torch
 from lightning.pytorch.core.optimizer import LightningOptimizer
-from torch import Tensor
+from torch import Tensor, nn
 
 from lightning_pose.data.batches import PoseBatch
 from lightning_pose.data.datamodule import SceneDataModule, scene_datamodule
@@ -66,6 +66,10 @@ class LandmarkMap(TrainingMemory, PoseModule):
         self.bundle_adjust: BundleAdjust = bundle_adjust
         self.refit = refit
         self.network = MapNetwork(self.input_shape[1] - 4)
+        # Several processes can only train what has a parameter, although each of them builds the whole map.
+        camera = self.network.get_buffer("camera")
+        del self.network.camera
+        self.network.camera = nn.Parameter(camera)
 
     @property
     def headline(self) -> str:

@@ -103,7 +103,7 @@ class MapNetwork(nn.Module):
         device = self.calibration.device
         for field in fields(point_map):
             kind = MAP_SHAPES[field.name][1]
-            setattr(self, field.name, torch.from_numpy(getattr(point_map, field.name)).to(device, kind))
+            getattr(self, field.name).data = torch.from_numpy(getattr(point_map, field.name)).to(device, kind)
         lens = -len(camera.distortion) if camera.lens else int(camera.fisheye)
         numbers = [camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, lens]
         numbers += [*camera.distortion, *[0.0] * (8 - len(camera.distortion))]
@@ -115,7 +115,7 @@ class MapNetwork(nn.Module):
     @property
     def point_map(self) -> PointMap:
         """The map; empty before `fit`."""
-        return PointMap(**{name: getattr(self, name).cpu().numpy() for name in MAP_SHAPES})
+        return PointMap(**{name: getattr(self, name).detach().cpu().numpy() for name in MAP_SHAPES})
 
     @property
     def view(self) -> Camera:
