@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import time
-from importlib.util import find_spec
 from pathlib import Path
 
 from lightning_pose.commands.parser import VerbParser
@@ -33,7 +33,7 @@ INSTALL = 'python -m pip install "lightning-camera-localization[reconstruct]"'
 def main(argv: list[str]) -> int:
     """Run the command with the arguments after its name; return the exit code."""
     args = _build_parser().parse_args(argv)
-    if find_spec("pycolmap") is None:
+    if importlib.util.find_spec("pycolmap") is None:
         raise ConfigError(f"reconstruct needs pycolmap, which is not installed; `{INSTALL}` installs it")
     from lightning_pose.reconstruction.alignment import parse_distance, read_positions
     from lightning_pose.reconstruction.pipeline import reconstruct

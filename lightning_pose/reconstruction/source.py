@@ -18,7 +18,7 @@ from lightning_pose.scenes.video_files import name_frame, read_video, write_fram
 
 __all__ = ["Source", "open_source"]
 
-NO_COLOUR = re.compile(r"depth|disparity|mask|normals?\b", re.IGNORECASE)
+NO_COLOUR = re.compile(r"depth|disparity|mask", re.IGNORECASE)
 """Words in the path of an image that is no photo."""
 
 
