@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
+import signal
+import threading
 import time
 from pathlib import Path
 
@@ -42,6 +44,8 @@ def main(argv: list[str]) -> int:
     from lightning_pose.reconstruction.source import open_source
     from lightning_pose.reconstruction.workspace import open_workspace
 
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)  # pycolmap's own handler prints a stack of calls
     camera = None if args.camera is None else Camera.parse(args.camera)
     distance = None if args.scale is None else parse_distance(args.scale)
     known = {} if args.align is None else read_positions(args.align)
