@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from pathlib import Path
 
@@ -69,6 +70,13 @@ def test_too_few_positions_and_positions_on_a_line() -> None:
     line = {name: np.array([i, 0.0, 0]) for i, name in enumerate(NAMES)}
     with pytest.raises(DataError, match="the 5 known positions are on one line"):
         align_positions(line, CENTRES)
+
+
+def test_positions_near_a_line_are_warned_of(caplog: pytest.LogCaptureFixture) -> None:
+    near = {name: np.array([i, 0.02 * (i == 2), 0]) for i, name in enumerate(NAMES)}
+    with caplog.at_level(logging.WARNING, "lightning_pose"):
+        align_positions(near, near)
+    assert "the 5 known positions are nearly on one line" in caplog.text
 
 
 def test_frames_are_found_by_name_and_number() -> None:
