@@ -20,7 +20,7 @@ from lightning_pose.features.surf.hessian import (
     compute_margin,
     view_head,
 )
-from lightning_pose.features.surf.strips import fill_octave
+from lightning_pose.features.surf.strips import StripProgram, get_program
 
 __all__ = ["Detections", "detect_keypoints", "find_maxima", "find_maxima_in_strips"]
 
@@ -136,14 +136,22 @@ def _allocate_planes(integral: Tensor) -> tuple[_Planes, list[Tensor]]:
 
 def find_maxima_in_strips(integral: Tensor, threshold: float) -> tuple[_Planes, Tensor, Tensor, Tensor]:
     """The maxima of one image (H + 1, W + 1), on a CPU: planes, and layer, place and determinant (1, C), by size."""
-    planes, octaves = _allocate_planes(integral[None])
-    keys = [np.zeros(0, np.int64)]
-    for octave, (det, start) in enumerate(zip(octaves, planes.grids[2].tolist(), strict=True)):
-        if det.numel():
-            found = fill_octave(integral.numpy(), octave, LOW, threshold, det[:, 0])
-            keys += [(place + start) * 4 + layer for layer, place in found]
+
+    def make() -> tuple[_Planes, StripProgram, list[int]]:
+        planes, octaves = _allocate_planes(integral[None])
+        height, width = integral.shape
+        sizes = [max(octave[0].numel(), 1) for octave in octaves]
+        return planes, StripProgram(height - 1, width - 1, [octave[:, 0] for octave in octaves], LOW), sizes
+
+    planes, program, sizes = get_program(*integral.shape, make)
+    found = program.run(integral.numpy())
+    keys = [
+        (place % size + start) * 4 + place // size
+        for place, size, start in zip(found, sizes, planes.grids[2].tolist(), strict=True)
+    ]
     key = np.concatenate(keys)
     scores = planes.det.numpy()[key % 4, key // 4]
+    key, scores = key[scores > threshold], scores[scores > threshold]
     # One sort of whole numbers: positive floats are in the order of their bits, and equal ones in that of their places.
     key = np.sort((0x7FFFFFFF - scores.view(np.int32)).astype(np.int64) << 32 | key) & 0xFFFFFFFF
     layer, at = (torch.from_numpy(column)[None] for column in (key % 4, key // 4))
