@@ -226,13 +226,11 @@ def _refine_candidates(integral: Tensor, planes: _Planes, found: _Candidates) ->
     width = planes.grids[1, found.octave]
     at = found.at + near.view(3, 1, 1) * width + near.view(3, 1)  # (3, 3, K): row, column
     plane = (found.layer - 1 + near[:, None]).clamp(0, 2)  # (3, K)
-    det = planes.det[plane[:, None, None], at]  # (3, 3, 3, K): layer, row, column
-    lowest, highest = found.layer == 1, found.layer == 3
-    outer = compute_determinants_at(
-        integral, found.octave, 4 * highest.long(), found.image, found.row, found.col
-    )  # layer 0 or 4, which `_Planes` does not hold
-    det[0] = torch.where(lowest, outer, det[0])
-    det[2] = torch.where(highest, outer, det[2])
+    index = plane[:, None, None] * planes.det.shape[1] + at
+    det = planes.det.view(-1).index_select(0, index.view(-1)).view(3, 3, 3, -1)  # layer, row, column
+    outer = (found.layer != 2).nonzero().squeeze(1)  # next to layer 0 or 4, which `_Planes` does not hold
+    layer, *place = (column[outer] for column in (found.layer, found.octave, found.image, found.row, found.col))
+    det[layer - 1, :, :, outer] = compute_determinants_at(integral, place[0], 2 * layer - 2, *place[1:]).movedim(2, 0)
 
     offset, inside = _find_top(det)
     strict = (det.view(27, -1) < det[1, 1, 1]).sum(0) == 26
