@@ -137,13 +137,14 @@ def _allocate_planes(integral: Tensor) -> tuple[_Planes, list[Tensor]]:
 def find_maxima_in_strips(integral: Tensor, threshold: float) -> tuple[_Planes, Tensor, Tensor, Tensor]:
     """The maxima of one image (H + 1, W + 1), on a CPU: planes, and layer, place and determinant (1, C), by size."""
 
+    height, width = integral.shape
+
     def make() -> tuple[_Planes, StripProgram, list[int]]:
         planes, octaves = _allocate_planes(integral[None])
-        height, width = integral.shape
         sizes = [max(octave[0].numel(), 1) for octave in octaves]
-        return planes, StripProgram(height - 1, width - 1, [octave[:, 0] for octave in octaves], LOW), sizes
+        return planes, StripProgram(height, width, [octave[:, 0] for octave in octaves], LOW), sizes
 
-    planes, program, sizes = get_program(*integral.shape, make)
+    planes, program, sizes = get_program(height, width, make)
     found = program.run(integral.numpy())
     keys = [
         (place % size + start) * 4 + place // size

@@ -106,9 +106,9 @@ def compute_determinants(integral: Tensor, octave: int, layer: int, first: int, 
     band = torch.sub(band[..., :cols:u], band[..., c::u], out=view_head(whole[1], batch, n, m))
     dxy = view_head(scratch[0], batch, n, m).copy_(band)
 
-    of_dxy, whole = scale_determinant(size)
+    of_dxy, of_all = scale_determinant(size)
     dxx.mul_(dyy).addcmul_(dxy, dxy, value=-of_dxy)
-    torch.mul(dxx, whole, out=out)
+    torch.mul(dxx, of_all, out=out)
 
 
 def scale_determinant(size: int) -> tuple[float, float]:

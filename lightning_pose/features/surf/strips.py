@@ -37,16 +37,16 @@ class StripProgram:
     """Finds the maxima of the determinant in images of one size; not for two threads at once.
 
     Args:
-        height: of the images.
-        width: of the images.
+        height: of the integral images.
+        width: of the integral images.
         planes: (3, h, w) float32 of each octave: where determinants of layers 1 to 3 are written to.
         low: margin of the planes, in samples.
     """
 
     def __init__(self, height: int, width: int, planes: list[Tensor], low: int) -> None:
-        self._integral = np.zeros((height + 1, width + 1), np.int32)
+        self._integral = np.empty((height, width), np.int32)
         self._low = low
-        self._steps: list[tuple[Callable[..., Any], ...]] = []
+        self._steps: list[tuple[Any, ...]] = []
         self._marks: list[np.ndarray] = []
         for octave, plane in enumerate(planes):
             plane.zero_()  # where filters do not fit
@@ -61,6 +61,10 @@ class StripProgram:
         for function, *arguments in self._steps:
             function(*arguments)
         return [np.flatnonzero(marks) for marks in self._marks]
+
+    def _do(self, function: Callable[..., Any], *arguments: object) -> None:
+        """Call this function with these arguments in each run."""
+        self._steps.append((function, *arguments))
 
     def _add_octave(self, octave: int, planes: Tensor) -> None:
         _, height, width = planes.shape
@@ -110,19 +114,17 @@ class StripProgram:
                 band = subtract(*(change(y, x, lobe, 0, n, m + t) for y in (other, one)))
                 sides.append(self._convert(subtract(band[:, t:], band[:, :-t]), number))
             dxy = sides[1]
-            self._steps.append((dxy.sub_, sides[0]))
+            self._do(dxy.sub_, sides[0])
         else:
             c = apart // step
             band = change(one, one, lobe, 0, n + c, m + c + t)
             band = subtract(band[c:], band[:-c])
             band = subtract(band[:, t:], band[:, :-t])
             dxy = self._convert(subtract(band[:, c:], band[:, :-c]), 2)
-        of_dxy, whole = scale_determinant(size)
-        self._steps += [
-            (dxx.mul_, dyy),
-            (partial(dxx.addcmul_, value=-of_dxy), dxy, dxy),
-            (partial(torch.mul, out=out), dxx, whole),
-        ]
+        of_dxy, of_all = scale_determinant(size)
+        self._do(dxx.mul_, dyy)
+        self._do(partial(dxx.addcmul_, value=-of_dxy), dxy, dxy)
+        self._do(partial(torch.mul, out=out), dxx, of_all)
 
     def _add_maxima(self, planes: np.ndarray, marks: np.ndarray, first: int, last: int) -> None:
         """Marks in rows from `first` to `last` of planes (3, h, w), whose rows beside these are known."""
@@ -130,17 +132,17 @@ class StripProgram:
         start = max(first - 1, 0)
         one, two, three = layers = planes[:, start : last + 1]
         lower, upper, every, peak = (buffer[: one.size].reshape(one.shape) for buffer in self._real.numpy())
-        self._steps += [(cv2.max, one, two, lower), (cv2.max, two, three, upper), (cv2.max, lower, three, every)]
+        self._do(cv2.max, one, two, lower)
+        self._do(cv2.max, two, three, upper)
+        self._do(cv2.max, lower, three, every)
         for k, highest in enumerate((lower, every, upper)):
             inset = compute_margin(k + 2) + 1 - self._low  # one sample more than the filters of the layer above need
             top, bottom = max(first, inset), min(last, height - inset)
             if top >= bottom or width <= 2 * inset:
                 continue
             inner = slice(top - start, bottom - start), slice(inset, width - inset)
-            self._steps += [
-                (cv2.dilate, highest, SQUARE, peak),
-                (np.greater_equal, layers[k][inner], peak[inner], marks[k, top:bottom, inset : width - inset]),
-            ]
+            self._do(cv2.dilate, highest, SQUARE, peak)
+            self._do(np.greater_equal, layers[k][inner], peak[inner], marks[k, top:bottom, inset : width - inset])
 
     def _view(self, octave: int, y: int, x: int, rows: int, columns: int) -> np.ndarray:
         """(rows, columns) of the integral image in steps of 2**octave pixels, from pixel (y, x) on."""
@@ -151,7 +153,7 @@ class StripProgram:
         if phase not in self._phases:
             part = self._integral[phase[0] :: step, phase[1] :: step]
             self._phases[phase] = np.empty(part.shape, np.int32)
-            self._steps.append((np.copyto, self._phases[phase], part))
+            self._do(np.copyto, self._phases[phase], part)
         y, x = y >> octave, x >> octave
         return self._phases[phase][y : y + rows, x : x + columns]
 
@@ -159,13 +161,13 @@ class StripProgram:
         """a - b; lasts until BUFFERS more are subtracted."""
         self._turn = (self._turn + 1) % BUFFERS
         difference = self._whole[self._turn, : a.size].reshape(a.shape)
-        self._steps.append((cv2.subtract, a, b, difference))
+        self._do(cv2.subtract, a, b, difference)
         return difference
 
     def _convert(self, values: np.ndarray, number: int) -> Tensor:
         """Values as float32, in the memory of this number."""
         real = self._real[number, : values.size].view(values.shape)
-        self._steps.append((real.copy_, torch.from_numpy(values)))
+        self._do(real.copy_, torch.from_numpy(values))
         return real
 
 
