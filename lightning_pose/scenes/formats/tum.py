@@ -32,11 +32,14 @@ MAX_DIFFERENCE_S = 0.02
 """Largest difference in time between an image and its pose."""
 
 CAMERAS = {
-    "freiburg1": Intrinsics(517.3, 516.5, 318.6, 255.3, (640, 480), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
-    "freiburg2": Intrinsics(520.9, 521.0, 325.1, 249.7, (640, 480), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
-    "freiburg3": Intrinsics(535.4, 539.2, 320.1, 247.6, (640, 480)),  # its images are undistorted
+    "1": Intrinsics(517.3, 516.5, 318.6, 255.3, (640, 480), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    "2": Intrinsics(520.9, 521.0, 325.1, 249.7, (640, 480), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    "3": Intrinsics(535.4, 539.2, 320.1, 247.6, (640, 480)),  # its images are undistorted
 }
-"""The calibrated colour cameras of the benchmark, by a part of the folder's name."""
+"""The calibrated colour cameras of the benchmark, by their number."""
+
+CAMERA_NAME = re.compile(r"(?<![a-z])(?:freiburg|fr)([123])(?!\d)", re.IGNORECASE)
+"""How the benchmark names its recordings: `rgbd_dataset_freiburg1_rpy`, or short `fr1_rpy`."""
 
 
 class Tum(SceneFormat):
@@ -78,7 +81,8 @@ class Tum(SceneFormat):
         sound = np.isfinite(pose_times) & ~np.array([bool(fault) for fault in found])
         known = Trajectory(pose_times[sound], position_m[sound], quats[sound])
         name = root.resolve().name
-        intrinsics = next((camera for key, camera in CAMERAS.items() if key in name), None)
+        camera = CAMERA_NAME.search(name)
+        intrinsics = CAMERAS[camera[1]] if camera else None
         frames = [
             Frame(listed.images[i], position, quat, name, int(i), float(listed.times[i]), intrinsics)
             for i, position, quat in zip(pairs[:, 0], position_m[rows], quats[rows], strict=True)
