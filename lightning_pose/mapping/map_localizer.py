@@ -106,8 +106,7 @@ class MapLocalizer:
     def locate(self, query: MapQuery) -> MapAnswer:
         """Where the image was taken: candidates, matches, RANSAC, one guided pass, refinement."""
         points = self._camera.remove(query.points)
-        similarity = self._matcher.compare(query.descriptors)
-        frame, rows, matched = self._matcher.match_candidates(similarity)
+        frame, rows, matched = self._matcher.match_candidates(query.descriptors)
         if len(rows) < MIN_MATCHES:
             few = f"too few features: {len(points)}" if len(points) < MIN_MATCHES else f"too few matches: {len(rows)}"
             return self._refuse(frame, few)
@@ -117,7 +116,7 @@ class MapLocalizer:
         pose, mask = found
         sigma = SIGMA_PX / query.focal_px
         pose = refine_pose(pose, self.map.points[matched[mask]], points[rows[mask]], 2 * sigma).pose
-        rows, matched, seen = self._matcher.match_guided(query, points, similarity, pose)
+        rows, matched, seen = self._matcher.match_guided(query, points, pose)
         visible = len(seen)
         if len(rows) < MIN_MATCHES:
             return self._refuse(frame, f"too few guided matches: {len(rows)} of {visible} points in view", visible)
