@@ -7,6 +7,7 @@ import numpy as np
 from lightning_pose.geometry.absolute_pose import CameraPose
 from lightning_pose.mapping.frames import MapQuery, find_distance_scale
 from lightning_pose.mapping.point_map import PointMap
+from lightning_pose.mapping.threads import multiply
 
 __all__ = ["QueryMatcher"]
 
@@ -50,7 +51,7 @@ class QueryMatcher:
         self.map = point_map
         self._descriptors = point_map.unit_descriptors
         self._main_axes = find_main_axes(self._descriptors, VOTE_COLUMNS)
-        self._few_columns = np.ascontiguousarray((self._descriptors @ self._main_axes).T)
+        self._few_columns = multiply(self._main_axes.T, self._descriptors.T)
         length = np.bincount(point_map.seen_point, minlength=len(point_map))
         self._vote = 1 / np.sqrt(np.maximum(length, 1))
         self._points_of_frame = point_map.seen_count.astype(np.int64)
@@ -73,7 +74,7 @@ class QueryMatcher:
         if not len(descriptors) or not len(self._descriptors):
             return -1, NONE, NONE
         rows = np.arange(len(descriptors))
-        nearest = ((descriptors @ self._main_axes) @ self._few_columns).argmax(axis=1)
+        nearest = multiply(multiply(descriptors, self._main_axes), self._few_columns).argmax(axis=1)
         voted = nearest[self._compare(descriptors, rows, nearest) > 1 - VOTE_DISTANCE**2 / 2]
         first, last = self._first_of_point[voted], self._first_of_point[voted + 1]
         votes = np.bincount(
@@ -86,7 +87,7 @@ class QueryMatcher:
         points = np.flatnonzero(likely)
         if len(points) < 2:
             return int(best[0]), NONE, NONE
-        among = descriptors @ self._descriptors[points].T
+        among = multiply(descriptors, self._descriptors[points].T)
         best_point = among.argmax(axis=1)
         value = among[rows, best_point]
         mutual = among.max(axis=0)[best_point] == value
@@ -97,7 +98,7 @@ class QueryMatcher:
         return int(best[0]), rows[kept], points[best_point[kept]]
 
     def match_guided(
-        self, query: MapQuery, points: np.ndarray, pose: CameraPose
+        self, query: MapQuery, points: np.ndarray, pose: CameraPose, radius_px: float = GUIDED_PX
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Mutual matches near where a pose puts the points that it should show.
 
@@ -105,6 +106,7 @@ class QueryMatcher:
             query: the image.
             points: (N, 2), its keypoints with the camera's error removed.
             pose: where the camera is thought to be.
+            radius_px: how far a keypoint may lie from its point.
 
         Returns:
             keypoints (K,), points (K,), and where the points that should be in view appear, (V, 2) normalised image
@@ -118,7 +120,7 @@ class QueryMatcher:
             inside = (np.abs(seen) <= query.half_view).all(axis=1) & (local[:, 2] > 0)
         visible = np.flatnonzero(inside & (-(away * self.map.direction).sum(axis=1) >= MIN_COSINE * distance))
         seen = seen[visible]
-        row, column = find_near_places(points, seen, GUIDED_PX / query.focal_px)
+        row, column = find_near_places(points, seen, radius_px / query.focal_px)
         point = visible[column]
         octaves = np.log2(query.size_px[row] / query.focal_px) - (self.map.log_size[point] - np.log2(distance[point]))
         alike = np.abs(octaves) <= SIZE_OCTAVES
@@ -140,7 +142,7 @@ class QueryMatcher:
 
 def find_main_axes(descriptors: np.ndarray, count: int) -> np.ndarray:
     """(D, count or D) float32, the axes along which (P, D) descriptors are longest, in all."""
-    _, axes = np.linalg.eigh((descriptors.T @ descriptors).astype(np.float64))
+    _, axes = np.linalg.eigh(multiply(descriptors.T, descriptors).astype(np.float64))
     return np.ascontiguousarray(axes[:, ::-1][:, :count], dtype=np.float32)
 
 
