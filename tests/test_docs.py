@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import ast
+import contextlib
 import re
 import shlex
+import shutil
 from collections.abc import Iterator
+from importlib import import_module
 from inspect import signature
 from pathlib import Path
 from typing import NamedTuple
@@ -81,6 +85,7 @@ def list_commands(page: Path) -> Iterator[Command]:
                         yield Command(f"{page.relative_to(REPOSITORY)}:{number}", text, section)
 
 
+PYTHON = [block for page in PAGES for block in re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)]
 COMMANDS = [command for page in PAGES for command in list_commands(page)]
 
 
@@ -181,6 +186,23 @@ def test_the_commands_run(workplace: Workplace, tmp_path: Path, capsys: pytest.C
         assert workplace.command(*fill_in(f"{text} {small}", str(room))) == 0, capsys.readouterr().err
     assert (workplace.folder / "table.tex").is_file()
     assert "LandmarkMap" in capsys.readouterr().out
+    (run,) = (run for run in workplace.runs() if run.data.tags["architecture"] == "LandmarkMap")
+    shutil.copy(workplace.checkpoint(run, "best"), workplace.folder / "best.ckpt")
+    shutil.copy(next(room.rglob("*.png")), workplace.folder / "image.jpg")
+    for block in PYTHON:
+        if 'Localizer.load("best.ckpt")' in block:
+            with contextlib.chdir(workplace.folder):
+                exec(block, {})
+            assert "accepted" in capsys.readouterr().out
+
+
+def test_what_python_imports_exists() -> None:
+    assert len(PYTHON) > 6
+    for block in PYTHON:
+        for node in ast.walk(ast.parse(block)):
+            if isinstance(node, ast.ImportFrom) and str(node.module).startswith("lightning_pose"):
+                module = import_module(str(node.module))
+                assert [name.name for name in node.names if not hasattr(module, name.name)] == []
 
 
 def list_parameters(kind: type) -> set[str]:
@@ -207,7 +229,7 @@ def test_options_in_the_text_exist(capsys: pytest.CaptureFixture[str]) -> None:
         for page in PAGES
         for span in re.findall(r"`([^`\n]*)`", page.read_text())
         if not span.startswith(SHELL)
-        for option in re.findall(r"(?<!\S)\[?(--[a-z][\w.]+)", span)
+        for option in re.findall(r"(?<!\S)\[?(--[a-z][\w.-]+)", span)
     }
     assert len(named) > 20
     assert sorted(named - known) == []
