@@ -85,7 +85,7 @@ class Stage:
 
 def read_stage() -> Stage:
     """Extract keypoints of the room, choose pairs and match them."""
-    datamodule = ImageDataModule(extractor=SURF(300, with_geometry=True), root=room_folder(seed=0, frames=300))
+    datamodule = ImageDataModule(extractor=SURF(300, with_geometry=True), root=str(room_folder(seed=0, frames=300)))
     datamodule.prepare_data()
     scene = datamodule.scene
     camera = datamodule.find_camera(int(scene.splits["train"][0]))
