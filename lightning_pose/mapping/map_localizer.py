@@ -118,25 +118,23 @@ class MapLocalizer:
 
         Args:
             query: the image.
-            prior: where it may have been taken, in the poses that the dataset gives. Points that it should show there
-                are tried first; then the whole map. A pose that agrees with it needs fewer inliers, a pose that does
-                not is refused.
+            prior: where it may have been taken, in the poses that the dataset gives. A pose near it is accepted as
+                without. Where none is found, points that the image should show there are matched, and fewer inliers
+                are needed. A pose that is not near it is refused.
         """
         points = self._camera.remove(query.points)
         similarity = self._matcher.compare(query.descriptors)
-        if prior is None:
-            return self._search(query, points, similarity)
-        near = self.carry_forward(prior)
-        tracked = self._track(query, points, similarity, near)
-        if tracked is not None and tracked.inliers >= ACCEPT_INLIERS:
-            return tracked
         found = self._search(query, points, similarity)
-        if found.accepted:
-            away, turned = self._measure_distance(found.pose_in_map, near)
-            if away <= PRIOR[0] and turned <= PRIOR[1]:
-                return found
+        if prior is None:
+            return found
+        near = self.carry_forward(prior)
+        away, turned = self._measure_distance(found.pose_in_map, near)
+        if found.accepted and away <= PRIOR[0] and turned <= PRIOR[1]:
+            return found
+        tracked = self._track(query, points, similarity, near)
+        if tracked is None and found.accepted:
             reason = f"contradicts the prior: {away:.1f} times the scene's median depth and {turned:.0f} degrees away"
-            found = replace(found, reason=reason)
+            return replace(found, reason=reason)
         return found if tracked is None else tracked
 
     def _track(self, query: MapQuery, points: np.ndarray, similarity: np.ndarray, near: CameraPose) -> MapAnswer | None:
