@@ -126,7 +126,7 @@ class Localizer:
                 it. That of the training images if not given.
             prior: where the camera is thought to be, for systems with a map. A pose that is not within half the median
                 depth of the map's points and 30 degrees of it is refused. Where the map finds none, the points that
-                the image should show there are matched, and 12 inliers are enough in place of 20.
+                the image should show there are matched.
 
         Returns:
             a pose, or a list of poses for a list.
