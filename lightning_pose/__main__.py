@@ -30,6 +30,11 @@ VERBS = {
     ),
     "check": ("lightning_pose.commands.check", "say what a dataset holds, and what is wrong with it"),
     "export-map": ("lightning_pose.commands.export_map", "write a landmark map as a COLMAP model and as PLY"),
+    "reconstruct": (
+        "lightning_pose.commands.reconstruct",
+        "find the poses of a video's frames, or of images (pycolmap)",
+    ),
+    "serve": ("lightning_pose.commands.serve", "answer images with poses over HTTP, with a page to try it"),
     "synth": ("lightning_pose.commands.synth", "render a synthetic room as a dataset"),
 }
 

@@ -36,8 +36,12 @@ class Evaluation:
 
 
 def skill(model: Mapping[str, float], baseline: Mapping[str, float]) -> dict[str, float]:
-    """The model's median errors divided by a baseline's, as `test/skill_*`; below 1, the model is better."""
+    """The model's median errors divided by a baseline's, as `test/skill_*`; below 1, the model is better.
+
+    A baseline without error, as where the camera never moves, gives no skill.
+    """
     return {
-        f"test/{name}": model[metric] / baseline[metric] if baseline[metric] else float("inf")
+        f"test/{name}": model[metric] / baseline[metric]
         for name, metric in zip(SKILLS, MEDIANS, strict=True)
+        if baseline[metric]
     }

@@ -74,7 +74,7 @@ def draw_matched_images(images: Sequence[MatchedImage], title: str = "Points of 
             )  # fmt: skip
         axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
         axes.set_title(image.caption, fontsize=9)
-        axes.legend(loc="lower right", fontsize=7)
+        axes.legend(loc="lower right", fontsize=7, frameon=True, framealpha=0.8)
     for axes in list(figure.axes)[len(images) :]:
         axes.set_axis_off()
     return figure

@@ -120,24 +120,23 @@ class MapLocalizer:
                 near it is refused.
         """
         points = self._camera.remove(query.points)
-        similarity = self._matcher.compare(query.descriptors)
-        found = self._search(query, points, similarity)
+        found = self._search(query, points)
         if prior is None:
             return found
         near = self.carry_forward(prior)
         away, turned = self._measure_distance(found.pose_in_map, near)
         if found.accepted and away <= PRIOR[0] and turned <= PRIOR[1]:
             return found
-        tracked = self._track(query, points, similarity, near)
+        tracked = self._track(query, points, near)
         if tracked is None and found.accepted:
             reason = f"contradicts the prior: {away:.1f} times the scene's median depth and {turned:.0f} degrees away"
             return replace(found, reason=reason)
         return found if tracked is None else tracked
 
-    def _track(self, query: MapQuery, points: np.ndarray, similarity: np.ndarray, near: CameraPose) -> MapAnswer | None:
+    def _track(self, query: MapQuery, points: np.ndarray, near: CameraPose) -> MapAnswer | None:
         """The accepted pose among the points that a pose of the map should show; None if there is none near it."""
-        matches = self._matcher.match_guided(query, points, similarity, near, PRIOR_PX)
-        found = self._solve(query, points, similarity, (-1, *matches[:2]))
+        matches = self._matcher.match_guided(query, points, near, PRIOR_PX)
+        found = self._solve(query, points, (-1, *matches[:2]))
         if not found.accepted:
             return None
         away, turned = self._measure_distance(found.pose_in_map, near)
@@ -148,15 +147,14 @@ class MapLocalizer:
         away = float(np.linalg.norm(a.position - b.position)) / self._depth
         return away, float(np.degrees(np.linalg.norm(Rotation.from_matrix(a.rotation.T @ b.rotation).as_rotvec())))
 
-    def _search(self, query: MapQuery, points: np.ndarray, similarity: np.ndarray) -> MapAnswer:
+    def _search(self, query: MapQuery, points: np.ndarray) -> MapAnswer:
         """The pose among the points of the most similar training frames."""
-        return self._solve(query, points, similarity, self._matcher.match_candidates(similarity))
+        return self._solve(query, points, self._matcher.match_candidates(query.descriptors))
 
     def _solve(
         self,
         query: MapQuery,
         points: np.ndarray,
-        similarity: np.ndarray,
         matches: tuple[int, np.ndarray, np.ndarray],
     ) -> MapAnswer:
         """The pose on which most matches agree, after one guided pass and refinement.
@@ -164,7 +162,6 @@ class MapLocalizer:
         Args:
             query: the image.
             points: (N, 2), its keypoints with the camera's error removed.
-            similarity: (N, P), from `compare`.
             matches: the frame whose pose holds where none is found, keypoints (K,) and points (K,).
         """
         frame, rows, matched = matches
@@ -177,7 +174,7 @@ class MapLocalizer:
         pose, mask = found
         sigma = SIGMA_PX / query.focal_px
         pose = refine_pose(pose, self.map.points[matched[mask]], points[rows[mask]], 2 * sigma).pose
-        rows, matched, seen = self._matcher.match_guided(query, points, similarity, pose)
+        rows, matched, seen = self._matcher.match_guided(query, points, pose)
         visible = len(seen)
         if len(rows) < MIN_MATCHES:
             return self._refuse(frame, f"too few guided matches: {len(rows)} of {visible} points in view", visible)

@@ -6,9 +6,10 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
+import numpy as np
 import torch
 
-__all__ = ["map_in_threads"]
+__all__ = ["map_in_threads", "multiply"]
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -29,3 +30,8 @@ def map_in_threads(work: Callable[[Item], Result], items: Iterable[Item]) -> lis
             return list(pool.map(work, items))
     finally:
         torch.set_num_threads(threads)
+
+
+def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The product of matrices by as many threads as torch has here; numpy's own would be as many in each thread."""
+    return (torch.from_numpy(a) @ torch.from_numpy(b)).numpy()

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, cast
 
 import torch
 from lightning.pytorch.core.optimizer import LightningOptimizer
-from torch import Tensor
+from torch import Tensor, nn
 
 from lightning_pose.data.batches import PoseBatch
 from lightning_pose.data.datamodule import SceneDataModule, scene_datamodule
@@ -19,7 +19,7 @@ from lightning_pose.models.base import PoseModule
 from lightning_pose.models.parts.answers import Answers, answer_by_map, convert_answers, localize_prior
 from lightning_pose.models.parts.frame_cameras import list_cameras, scale_cameras
 from lightning_pose.models.parts.map_builder import BundleAdjust, MapBuilder, check_bundle_adjust, check_keypoints
-from lightning_pose.models.parts.map_network import MAP_SHAPES, MapNetwork
+from lightning_pose.models.parts.map_network import RESIZED, MapNetwork
 from lightning_pose.models.parts.memory import TrainingMemory
 from lightning_pose.models.parts.poses import Located
 
@@ -50,7 +50,7 @@ class LandmarkMap(TrainingMemory, PoseModule):
 
     input_ranks: ClassVar[tuple[int, ...]] = (2,)
     refusal: ClassVar[str] = "is a map itself"
-    memory: ClassVar[tuple[str, ...]] = tuple(f"network.{name}" for name in MAP_SHAPES if name != "camera")
+    memory: ClassVar[tuple[str, ...]] = tuple(f"network.{name}" for name in RESIZED)
     network: MapNetwork
 
     def __init__(
@@ -67,6 +67,10 @@ class LandmarkMap(TrainingMemory, PoseModule):
         self.bundle_adjust: BundleAdjust = bundle_adjust
         self.refit = refit
         self.network = MapNetwork(self.input_shape[1] - 4)
+        # Several processes can only train what has a parameter, although each of them builds the whole map.
+        camera = self.network.get_buffer("camera")
+        del self.network.camera
+        self.network.camera = nn.Parameter(camera)
 
     @property
     def headline(self) -> str:

@@ -12,6 +12,7 @@ from torch.utils.data import DataLoader
 
 from lightning_pose.data.batches import PoseBatch
 from lightning_pose.data.datamodule import find_datamodule
+from lightning_pose.errors import CheckpointError
 from lightning_pose.runs.callbacks import find_callback
 from lightning_pose.runs.checkpoint_files import use_checkpoint_files
 from lightning_pose.runs.logger import MLflowLogger
@@ -41,6 +42,19 @@ class _RunCheckpoint(ModelCheckpoint):
         if stage == "fit":
             self.dirpath = str(checkpoint_folder(trainer))
         super().setup(trainer, pl_module, stage)
+
+    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Make the folder now: a first epoch may take an hour.
+
+        Raises:
+            CheckpointError: it cannot be made.
+        """
+        try:
+            checkpoint_folder(trainer).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise CheckpointError(
+                f"cannot make {self.dirpath} ({error.strerror}); choose another folder with --trainer.default_root_dir"
+            ) from error
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore the best score of the same run; its folder may have moved."""
@@ -143,6 +157,7 @@ class LastCheckpoint(_RunCheckpoint):
         self._random_states = state_dict.get("random_states")
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        super().on_fit_start(trainer, pl_module)
         if self.finishes and self._stopped:
             trainer.should_stop = True
 

@@ -15,6 +15,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import cv2
 from lightning.fabric.utilities.rank_zero import rank_zero_only
 from lightning.pytorch.loggers import MLFlowLogger
 
@@ -26,6 +27,7 @@ from lightning_pose.runs.process import has_owner_died, process_tags
 from lightning_pose.runs.reader import mask_passwords, read_pages
 from lightning_pose.runs.store import prepare_store, sqlite_file
 from lightning_pose.runs.tags import PARENT_TAG
+from lightning_pose.scenes.images import read_rgb
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -277,12 +279,13 @@ def _list_folders(value: object) -> list[Path]:
     return [Path(str(name)).expanduser().resolve() for name in names]
 
 
-def log_localizer(logger: MLflowLogger, checkpoint: Path) -> None:
-    """Log a localizer to the run as `model`, for `mlflow.pyfunc.load_model`.
+def log_localizer(logger: MLflowLogger, checkpoint: Path, example: Path | None = None) -> None:
+    """Log a localizer to the run as `model`, for `mlflow.pyfunc.load_model` and `mlflow models serve`.
 
     Args:
         logger: of the run.
         checkpoint: that the run has written; the model may import the classes of the user's own that it names.
+        example: an image of the scene, which is kept with the model as its input example, as JPEG.
     """
     named = find_class_paths(read_checkpoint(checkpoint)["lightning_pose"])
     allow = [path for path in named if "." in path and not path.startswith(f"{PACKAGE.name}.")]
@@ -291,15 +294,24 @@ def log_localizer(logger: MLflowLogger, checkpoint: Path) -> None:
     # Messages on pip, which uv lacks, on type hints of tables, and on a lock file that MLflow copies.
     for noisy in ("mlflow.utils.environment", "mlflow.models.signature", "mlflow.utils.uv_utils"):
         logging.getLogger(noisy).setLevel(logging.ERROR)
-    logger.client.attempt(partial(_log_model, logger, checkpoint, allow))
+    logger.client.attempt(partial(_log_model, logger, checkpoint, allow, example))
 
 
-def _log_model(logger: MLflowLogger, checkpoint: Path, allow: list[str]) -> None:
+def _encode_jpeg(image: Path) -> bytes:
+    """The pixels of an image file as JPEG, which is smaller than most."""
+    return cv2.imencode(".jpg", cv2.cvtColor(read_rgb(image), cv2.COLOR_RGB2BGR))[1].tobytes()
+
+
+def _log_model(logger: MLflowLogger, checkpoint: Path, allow: list[str], example: Path | None) -> None:
     """Log the model, as MLflow does it for a run that is active in this process."""
     import mlflow
+    import pandas as pd
 
+    from lightning_pose.localization.mlflow_signature import SIGNATURE
+
+    shown = {} if example is None else {"input_example": pd.DataFrame({"image": [_encode_jpeg(example)]})}
     with _keep_environment(), warnings.catch_warnings():
-        # The model takes files, for which MLflow has no schema, and it warns of that.
+        # MLflow warns of columns of whole numbers that may be missing; these are only in the answer.
         warnings.simplefilter("ignore", UserWarning)
         mlflow.set_tracking_uri(logger.uri)
         with mlflow.start_run(run_id=str(logger.run_id)):
@@ -307,6 +319,8 @@ def _log_model(logger: MLflowLogger, checkpoint: Path, allow: list[str]) -> None
                 name="model",
                 python_model=str(PACKAGE / "localization" / "mlflow_model.py"),
                 artifacts={"checkpoint": str(checkpoint)},
+                signature=SIGNATURE,
+                **shown,
                 model_config={"allow": allow},
                 code_paths=[str(PACKAGE)],
                 pip_requirements=[f"{name}=={version(name)}" for name in REQUIREMENTS],

@@ -256,7 +256,7 @@ def _replace_places(connection: sqlite3.Connection, old: str, new: str) -> None:
         for table, column in LOCATIONS:
             if table in tables:
                 connection.execute(
-                    f"UPDATE {table} SET {column} = ? || substr({column}, ?) "
+                    f"UPDATE {table} SET {column} = ? || substr({column}, ?) "  # noqa: S608  # names of LOCATIONS alone
                     f"WHERE {column} = ? OR substr({column}, 1, ?) = ?",
                     (new, len(old) + 1, old, len(old) + 1, f"{old}/"),
                 )

@@ -24,7 +24,8 @@ class Intrinsics:
         cx: principal point.
         cy: principal point.
         size: width and height of the images that the numbers are for; None for the images as they are.
-        distortion: OpenCV's coefficients k1 k2 p1 p2 k3 ..., or with `fisheye` k1 k2 k3 k4; empty for none.
+        distortion: OpenCV's coefficients k1 k2 p1 p2 k3 ..., or with `fisheye` k1 k2 k3 k4 or those of another lens, as
+            `Camera` has them; empty for none.
         fisheye: whether the distortion is that of a fisheye lens (equidistant).
     """
 

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from lightning_pose.errors import ConfigError
+from lightning_pose.geometry.camera import Camera
+from lightning_pose.localization.image_sizes import MAX_ENLARGED_PIXELS, enlarge_image
 from lightning_pose.localization.localizer import Localizer
 from lightning_pose.localization.located_pose import stack_poses
 from tests.rooms import MappedRoom
@@ -39,3 +41,14 @@ def test_a_part_of_an_image_needs_its_camera(localizer: Localizer, mapped_room: 
         ConfigError, match=r"240x200 pixels, and its camera is for 320x240.*give camera for its own size"
     ):
         localizer.localize(parts)
+
+
+def test_an_enlarged_image_stays_small(located: tuple[Localizer, list[np.ndarray], np.ndarray]) -> None:
+    """Whatever focal length a stranger's camera has."""
+    view = located[0].system.view
+    assert view is not None
+    image = np.zeros((3000, 4000), np.uint8)
+    for focal in (1e-9, 1.0, 4000 * view.fx / view.width):
+        camera = Camera.parse(f"PINHOLE,4000,3000,{focal},{focal},2000,1500")
+        enlarged = enlarge_image(image, view, camera)
+        assert image.size <= enlarged.size < 1.01 * MAX_ENLARGED_PIXELS

@@ -69,7 +69,7 @@ def test_an_image_that_is_missing(localizer: Localizer) -> None:
     [
         (None, r"images is None \(NoneType\); give an image file"),
         (7, r"images is 7 \(int\)"),
-        (b"a.png", r"images is b'a.png' \(bytes\)"),
+        ({"image": "a.png"}, r"images is {'image': 'a.png'} \(dict\)"),
         ([None], r"image 0 is None \(NoneType\)"),
         (np.zeros((4, 5), np.float32), r"shape \(4, 5\) and type float32; give uint8 of shape \(H, W\) gray"),
         ([np.zeros((4, 5, 4), np.uint8)], r"shape \(4, 5, 4\) and type uint8"),
@@ -108,10 +108,19 @@ def test_a_checkpoint_without_data(trained: Trained, tmp_path: Path) -> None:
 def test_one_image_may_stand_alone(localizer: Localizer, images: list[Path]) -> None:
     (expected,) = localizer.localize(images[:1])
     in_color = Image.open(images[0]).convert("RGB")
-    for image in (images[0], str(images[0]), read_gray(images[0]), in_color, np.asarray(in_color)):
+    for image in (
+        images[0],
+        str(images[0]),
+        images[0].read_bytes(),
+        read_gray(images[0]),
+        in_color,
+        np.asarray(in_color),
+    ):
         pose = localizer.localize(image)
         np.testing.assert_array_equal(pose.position_m, expected.position_m)
         np.testing.assert_array_equal(pose.quat_wxyz, expected.quat_wxyz)
+    with pytest.raises(ImageError, match=r"^the image is truncated or is not an image"):
+        localizer.localize(b"a.png")
     with pytest.raises(ImageError, match=r"^a\.png does not exist"):
         localizer.localize("a.png")
 

@@ -20,12 +20,14 @@ from lightning_pose.models import LandmarkMap
 from tests.models.helpers import WALL_CAMERA, WALL_KEYPOINTS, WallProblem
 
 
-def fit_wall(problem: WallProblem | None = None, **settings: object) -> tuple[LandmarkMap, WallProblem]:
+def fit_wall(
+    problem: WallProblem | None = None, strategy: str = "auto", **settings: object
+) -> tuple[LandmarkMap, WallProblem]:
     problem = problem or WallProblem([WALL_KEYPOINTS, 36])
     model = LandmarkMap(**{"input_shape": [WALL_KEYPOINTS, 36], "bundle_adjust": False, **settings})  # type: ignore[arg-type]
     trainer = Trainer(
         max_epochs=1, accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False,
-        enable_model_summary=False,
+        enable_model_summary=False, strategy=strategy,
     )  # fmt: skip
     trainer.fit(model, datamodule=problem)
     return model.eval(), problem
@@ -40,6 +42,16 @@ def test_test_frames_are_located_to_a_centimetre(fitted: tuple[LandmarkMap, Wall
     model, problem = fitted
     data = problem.dataset("test").data
     assert position_error_m(model(data.features).position_m, data.position_m).median() < 0.01
+
+
+def test_processes_that_share_the_training_build_the_same_map(fitted: tuple[LandmarkMap, WallProblem]) -> None:
+    """One process, in a group of one, as each of several is."""
+    try:
+        model, _ = fit_wall(strategy="ddp")
+    finally:
+        torch.distributed.destroy_process_group()
+    for name, value in fitted[0].state_dict().items():
+        assert torch.equal(model.state_dict()[name], value), name
 
 
 def test_without_a_camera_the_focal_length_is_found_and_printed(capsys: pytest.CaptureFixture[str]) -> None:

@@ -81,3 +81,13 @@ def test_another_way_of_a_user_s_own_is_kept() -> None:
     trainer = Trainer(accelerator="cpu", logger=False, enable_checkpointing=False, plugins=[own := Own()])
     use_checkpoint_files(trainer)
     assert trainer.strategy.checkpoint_io is own
+
+
+def test_a_folder_that_cannot_be_made_is_refused_before_training(
+    workplace: Workplace, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (workplace.folder / "taken").write_text("a file where the folder would be")
+    assert workplace.run("fit", "--trainer.default_root_dir", "taken") == 2
+    output = "".join(capfd.readouterr())
+    assert "choose another folder with --trainer.default_root_dir" in output
+    assert "epoch 1/" not in output

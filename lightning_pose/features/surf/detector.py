@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from lightning_pose.features.surf.hessian import (
     OCTAVES,
@@ -21,8 +20,9 @@ from lightning_pose.features.surf.hessian import (
     compute_margin,
     view_head,
 )
+from lightning_pose.features.surf.strips import StripProgram, get_program
 
-__all__ = ["Detections", "detect_keypoints"]
+__all__ = ["Detections", "detect_keypoints", "find_maxima", "find_maxima_in_strips"]
 
 LOW = compute_margin(2)
 """First sample of each octave that can be a neighbour of a maximum; planes of determinants start here."""
@@ -49,12 +49,10 @@ class _Planes(NamedTuple):
 
     Attributes:
         det: (3, S) float32 determinants.
-        bits: (S,) float32, bit k set at a candidate of layer k + 1.
         grids: (3, OCTAVES) int64: height, width, and start of each octave in S.
     """
 
     det: Tensor
-    bits: Tensor
     grids: Tensor
 
 
@@ -68,10 +66,6 @@ class _Candidates(NamedTuple):
     row: Tensor
     col: Tensor
 
-    def pick(self, which: Tensor) -> _Candidates:
-        """The candidates at these indices."""
-        return _Candidates(*(column[which] for column in self))
-
 
 def detect_keypoints(integral: Tensor, n: int, threshold: float) -> Detections:
     """Find the n strongest features of each image whose determinant is above the threshold.
@@ -81,50 +75,114 @@ def detect_keypoints(integral: Tensor, n: int, threshold: float) -> Detections:
         n: rows to return per image.
         threshold: determinants must be larger than this; OpenCV's hessianThreshold.
     """
-    planes = _compute_planes(integral, threshold)
-    candidates, score = _list_candidates(planes, len(integral))
-    total = len(score)
-    scores = score.new_zeros((len(integral), total))
-    scores[candidates.image, torch.arange(total, device=score.device)] = score
-    scores, ranking = scores.sort(dim=1, descending=True, stable=True)
+    if integral.device.type != "cpu" or not len(integral):
+        return _refine_strongest(integral, *find_maxima(integral, threshold), n)
+    found = [_refine_strongest(image[None], *find_maxima_in_strips(image, threshold), n) for image in integral]
+    return Detections(*(torch.cat(column) for column in zip(*found, strict=True)))
 
+
+def _refine_strongest(
+    integral: Tensor, planes: _Planes, layer: Tensor, at: Tensor, scores: Tensor, n: int
+) -> Detections:
+    """The n strongest features of each image among candidates.
+
+    Args:
+        integral: (B, H + 1, W + 1) int32.
+        planes: of these images.
+        layer: (B, C) int64, candidates by falling score.
+        at: (B, C) int64, index into `planes`.
+        scores: (B, C) float32, the determinants; 0 for no candidate.
+        n: rows to return per image.
+    """
     # Refining takes longer than sorting, and keeps about two thirds: candidates are refined from the strongest down,
     # until each image has n.
     found = []
     enough = max(2 * n, 600)
-    for first in range(0, total, enough):
-        response, pick = (t[:, first : first + enough] for t in (scores, ranking))
-        keep, *place = (t.view_as(pick) for t in _refine_candidates(integral, planes, candidates.pick(pick.flatten())))
+    for first in range(0, scores.shape[1], enough):
+        response, *which = (t[:, first : first + enough] for t in (scores, layer, at))
+        candidates = _locate(planes, len(integral), *(t.flatten() for t in which))
+        keep, *place = (t.view_as(response) for t in _refine_candidates(integral, planes, candidates))
         keep &= response > 0
         found.append(torch.stack([keep, *place, response], -1).where(keep[..., None], 0))
         if torch.cat(found, 1)[..., 0].sum(1).min() >= n:
             break
-    features = torch.cat([*found, score.new_zeros((len(integral), n, 5))], 1)
+    features = torch.cat([*found, scores.new_zeros((len(integral), n, 5))], 1)
     strongest = features[..., 0].argsort(dim=1, descending=True, stable=True)[:, :n]
     features = features.gather(1, strongest[..., None].expand(-1, -1, 5))
     return Detections(features[..., 1:3], features[..., 3], features[..., 4], features[..., 0].sum(1).long())
 
 
-def _compute_planes(integral: Tensor, threshold: float) -> _Planes:
-    """Compute the determinants of layers 1 to 3 of all octaves, and mark candidates."""
-    batch, height, width = integral.shape
-    shapes = [[max((side - 1 >> octave) - 2 * LOW, 0) for side in (height, width)] for octave in range(OCTAVES)]
-    ends = np.cumsum([batch * h * w for h, w in shapes]).tolist()
-    block = torch.empty(4 * (ends[-1] + integral.numel()), device=integral.device)
-    samples, scratch = block[: 4 * ends[-1]].view(4, -1), block[4 * ends[-1] :].view(4, -1)
-    starts = [0, *ends[:-1]]
-    for octave, ((h, w), start, end) in enumerate(zip(shapes, starts, ends, strict=True)):
-        if start < end:
-            *det, bits = samples[:, start:end].view(4, batch, h, w)
-            det[2].zero_()  # the filters of layer 3 do not fit around the outer samples
-            for layer, plane in enumerate(det, 1):
-                inset = max(compute_margin(layer) - LOW, 0)
-                inner = plane[:, inset : h - inset, inset : w - inset]
-                if inner.numel():
-                    compute_determinants(integral, octave, layer, LOW + inset, scratch, inner)
-            _mark_maxima(det, threshold, scratch, bits.zero_())
-    grids = torch.tensor([*zip(*shapes, strict=True), starts], device=integral.device)
-    return _Planes(samples[:3], samples[3], grids)
+def _locate(planes: _Planes, batch: int, layer: Tensor, at: Tensor) -> _Candidates:
+    """Octave, image, row and column of candidates."""
+    heights, widths, starts = planes.grids
+    octave = torch.bucketize(at, starts + batch * heights * widths, right=True)
+    height, width, start = planes.grids[:, octave]
+    line = torch.div(at - start, width, rounding_mode="floor")
+    image = torch.div(line, height, rounding_mode="floor")
+    row, col = line - image * height + LOW, at - start - line * width + LOW
+    return _Candidates(at, octave, layer, image, row, col)
+
+
+def _allocate_planes(integral: Tensor) -> tuple[_Planes, list[Tensor]]:
+    """Planes for the octaves, and each octave's part of them, (3, B, height, width)."""
+    batch, *sides = integral.shape
+    shapes = [[max((side - 1 >> octave) - 2 * LOW, 0) for side in sides] for octave in range(OCTAVES)]
+    sizes = [batch * h * w for h, w in shapes]
+    det = torch.empty((3, sum(sizes)), device=integral.device)
+    starts = np.cumsum([0, *sizes[:-1]]).tolist()
+    octaves = [part.view(3, batch, h, w) for part, (h, w) in zip(det.split(sizes, 1), shapes, strict=True)]
+    return _Planes(det, torch.tensor([*zip(*shapes, strict=True), starts], device=integral.device)), octaves
+
+
+def find_maxima_in_strips(integral: Tensor, threshold: float) -> tuple[_Planes, Tensor, Tensor, Tensor]:
+    """The maxima of one image (H + 1, W + 1), on a CPU: planes, and layer, place and determinant (1, C), by size."""
+
+    height, width = integral.shape
+
+    def make() -> tuple[_Planes, StripProgram, list[int]]:
+        planes, octaves = _allocate_planes(integral[None])
+        sizes = [max(octave[0].numel(), 1) for octave in octaves]
+        return planes, StripProgram(height, width, [octave[:, 0] for octave in octaves], LOW), sizes
+
+    planes, program, sizes = get_program(height, width, make)
+    found = program.run(integral.numpy())
+    keys = [
+        (place % size + start) * 4 + place // size
+        for place, size, start in zip(found, sizes, planes.grids[2].tolist(), strict=True)
+    ]
+    key = np.concatenate(keys)
+    scores = planes.det.numpy()[key % 4, key // 4]
+    key, scores = key[scores > threshold], scores[scores > threshold]
+    # One sort of whole numbers: positive floats are in the order of their bits, and equal ones in that of their places.
+    key = np.sort((0x7FFFFFFF - scores.view(np.int32)).astype(np.int64) << 32 | key) & 0xFFFFFFFF
+    layer, at = (torch.from_numpy(column)[None] for column in (key % 4, key // 4))
+    return planes, layer + 1, at, planes.det[layer, at]
+
+
+def find_maxima(integral: Tensor, threshold: float) -> tuple[_Planes, Tensor, Tensor, Tensor]:
+    """The maxima of images (B, H + 1, W + 1), on any device: as `find_maxima_in_strips`, with a row (C) each."""
+    batch = len(integral)
+    planes, octaves = _allocate_planes(integral)
+    scratch = torch.empty((4, integral.numel()), device=integral.device)
+    bits = torch.zeros(planes.det.shape[1], device=integral.device)
+    parts = bits.split([octave[0].numel() for octave in octaves])
+    for octave, (det, part) in enumerate(zip(octaves, parts, strict=True)):
+        h, w = det.shape[2:]
+        if not det.numel():
+            continue
+        det[2].zero_()  # the filters of layer 3 do not fit around the outer samples
+        for layer, plane in enumerate(det, 1):
+            inset = max(compute_margin(layer) - LOW, 0)
+            inner = plane[:, inset : h - inset, inset : w - inset]
+            if inner.numel():
+                compute_determinants(integral, octave, layer, LOW + inset, scratch, inner)
+        _mark_maxima([*det], threshold, scratch, part.view(batch, h, w))
+    at, layer = (bits[:, None].int() & bits.new_tensor([1, 2, 4], dtype=torch.int32)).nonzero().unbind(1)
+    score = planes.det[layer, at]
+    scores = score.new_zeros((batch, len(score)))
+    scores[_locate(planes, batch, layer, at).image, torch.arange(len(score), device=score.device)] = score
+    scores, ranking = scores.sort(dim=1, descending=True, stable=True)
+    return planes, (layer + 1)[ranking], at[ranking], scores
 
 
 def _mark_maxima(det: list[Tensor], threshold: float, scratch: Tensor, bits: Tensor) -> None:
@@ -158,28 +216,6 @@ def _mark_maxima(det: list[Tensor], threshold: float, scratch: Tensor, bits: Ten
     mark(2)
 
 
-def _list_candidates(planes: _Planes, batch: int) -> tuple[_Candidates, Tensor]:
-    """List the marked samples, and their determinants."""
-    marked = _find_nonzero(planes.bits)
-    layer, entry = (planes.bits[marked].int() & marked.new_tensor([[1], [2], [4]])).nonzero().unbind(1)
-    at = marked[entry]
-    heights, widths, starts = planes.grids
-    octave = torch.bucketize(at, starts + batch * heights * widths, right=True)
-    height, width, start = planes.grids[:, octave]
-    line = torch.div(at - start, width, rounding_mode="floor")
-    image = torch.div(line, height, rounding_mode="floor")
-    row, col = line - image * height + LOW, at - start - line * width + LOW
-    return _Candidates(at, octave, layer + 1, image, row, col), planes.det[layer, at]
-
-
-def _find_nonzero(values: Tensor) -> Tensor:
-    """Indices of values (S,) that are not zero; eight are tested at a time, because few are not zero."""
-    flags = pad(values.bool(), (0, -len(values) % 8))
-    words = flags.view(torch.int64).nonzero().squeeze(1)
-    word, byte = flags.view(-1, 8)[words].nonzero().unbind(1)
-    return words[word] * 8 + byte
-
-
 def _refine_candidates(integral: Tensor, planes: _Planes, found: _Candidates) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Compare K candidates with all 26 neighbours, and move them to the maximum of the quadric through these.
 
@@ -191,13 +227,11 @@ def _refine_candidates(integral: Tensor, planes: _Planes, found: _Candidates) ->
     width = planes.grids[1, found.octave]
     at = found.at + near.view(3, 1, 1) * width + near.view(3, 1)  # (3, 3, K): row, column
     plane = (found.layer - 1 + near[:, None]).clamp(0, 2)  # (3, K)
-    det = planes.det[plane[:, None, None], at]  # (3, 3, 3, K): layer, row, column
-    lowest, highest = found.layer == 1, found.layer == 3
-    outer = compute_determinants_at(
-        integral, found.octave, 4 * highest.long(), found.image, found.row, found.col
-    )  # layer 0 or 4, which `_Planes` does not hold
-    det[0] = torch.where(lowest, outer, det[0])
-    det[2] = torch.where(highest, outer, det[2])
+    index = plane[:, None, None] * planes.det.shape[1] + at
+    det = planes.det.view(-1).index_select(0, index.view(-1)).view(3, 3, 3, -1)  # layer, row, column
+    outer = (found.layer != 2).nonzero().squeeze(1)  # next to layer 0 or 4, which `_Planes` does not hold
+    layer, *place = (column[outer] for column in (found.layer, found.octave, found.image, found.row, found.col))
+    det[layer - 1, :, :, outer] = compute_determinants_at(integral, place[0], 2 * layer - 2, *place[1:]).movedim(2, 0)
 
     offset, inside = _find_top(det)
     strict = (det.view(27, -1) < det[1, 1, 1]).sum(0) == 26

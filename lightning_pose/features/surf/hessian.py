@@ -12,6 +12,7 @@ from functools import lru_cache
 from itertools import product
 from typing import TypeVar
 
+import cv2
 import torch
 from torch import Tensor
 
@@ -23,6 +24,8 @@ __all__ = [
     "compute_filter_size",
     "compute_integral_image",
     "compute_margin",
+    "find_lobe_edges",
+    "scale_determinant",
     "view_head",
 ]
 
@@ -38,9 +41,13 @@ def compute_integral_image(gray: Tensor) -> Tensor:
     Entry [:, y, x] is the sum over rows < y and columns < x. On very large images the sums overflow, but box sums below
     2**31 are still exact.
     """
-    rows = torch.cumsum(gray, 2, dtype=torch.int32)
-    integral = gray.new_zeros((gray.shape[0], gray.shape[1] + 1, gray.shape[2] + 1), dtype=torch.int32)
-    torch.cumsum(rows, 1, dtype=torch.int32, out=integral[:, 1:, 1:])
+    batch, height, width = gray.shape
+    integral = gray.new_zeros((batch, height + 1, width + 1), dtype=torch.int32)
+    if gray.device.type == "cpu":
+        for image, sums in zip(gray.numpy(), integral.numpy(), strict=True):
+            cv2.integral(image, sums, sdepth=cv2.CV_32S)
+    else:
+        torch.cumsum(torch.cumsum(gray, 2, dtype=torch.int32), 1, dtype=torch.int32, out=integral[:, 1:, 1:])
     return integral
 
 
@@ -71,7 +78,7 @@ def compute_determinants(integral: Tensor, octave: int, layer: int, first: int, 
         out: (B, n, m) float32.
     """
     size, step, start = compute_filter_size(octave, layer), 1 << octave, (first - compute_margin(layer)) << octave
-    lobe, near, far, first_lobe, second_lobe = _find_lobe_edges(size)
+    lobe, near, far, first_lobe, second_lobe = find_lobe_edges(size)
     (batch, n, m), t = out.shape, lobe // step
     whole = scratch.view(torch.int32)
     dxx, dyy = view_head(scratch[2], batch, n, m), view_head(scratch[3], batch, n, m)
@@ -87,7 +94,6 @@ def compute_determinants(integral: Tensor, octave: int, layer: int, first: int, 
     _sum_lobes([band.narrow(2, k * t, m) for k in range(4)], whole[1], dxx)
     band = change(0, near, 0, far, n + 3 * t, m)
     _sum_lobes([band.narrow(1, k * t, n) for k in range(4)], whole[1], dyy)
-    dxx.mul_(dyy)
 
     apart = second_lobe - first_lobe
     grid = math.gcd(step, apart)  # the lobes of dxy are not always whole samples apart
@@ -98,11 +104,18 @@ def compute_determinants(integral: Tensor, octave: int, layer: int, first: int, 
     band = torch.sub(band[:, :rows:u], band[:, c::u], out=view_head(whole[1], batch, n, wide + t))
     band = torch.sub(band[..., t:], band[..., :-t], out=view_head(whole[0], batch, n, wide))
     band = torch.sub(band[..., :cols:u], band[..., c::u], out=view_head(whole[1], batch, n, m))
-    dxy = dyy.copy_(band)
+    dxy = view_head(scratch[0], batch, n, m).copy_(band)
 
+    of_dxy, of_all = scale_determinant(size)
+    dxx.mul_(dyy).addcmul_(dxy, dxy, value=-of_dxy)
+    torch.mul(dxx, of_all, out=out)
+
+
+def scale_determinant(size: int) -> tuple[float, float]:
+    """Weight of dxy's square beside the product of dxx and dyy, and then of all, for sums of a filter of this size."""
+    lobe, near, far, *_ = find_lobe_edges(size)
     area = lobe * (far - near)
-    dxx.addcmul_(dxy, dxy, value=-((0.9 * area / lobe**2) ** 2))
-    torch.mul(dxx, area**-2, out=out)
+    return (0.9 * area / lobe**2) ** 2, area**-2
 
 
 def compute_determinants_at(
@@ -130,7 +143,7 @@ def compute_determinants_at(
     return dxx * dyy - dxy * dxy
 
 
-def _find_lobe_edges(size: int) -> tuple[int, int, int, int, int]:
+def find_lobe_edges(size: int) -> tuple[int, int, int, int, int]:
     """Positions of the lobes in a filter of this size, scaled from the paper's 9 x 9 filters.
 
     Returns:
@@ -158,7 +171,7 @@ def _make_boxes(device: torch.device) -> tuple[Tensor, Tensor]:
     boxes, areas = [], []
     for octave, layer in product(range(OCTAVES), range(LAYERS)):
         size = compute_filter_size(octave, layer)
-        lobe, near, far, first, second = _find_lobe_edges(size)
+        lobe, near, far, first, second = find_lobe_edges(size)
         long, whole, middle = (near, far), (0, size), (lobe, 2 * lobe)
         diagonal = [(k, k + lobe) for k in (first, second)]
         spans = [(long, whole), (long, middle), (whole, long), (middle, long), *product(diagonal, diagonal)]

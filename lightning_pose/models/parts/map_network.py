@@ -39,6 +39,9 @@ MAP_SHAPES = {
 
 CAMERA_NUMBERS = 15
 
+RESIZED = ("camera_numbers", *(name for name in MAP_SHAPES if name != "camera"))
+"""Buffers whose length is that of the checkpoint: some lenses have more coefficients."""
+
 
 def keypoints_to_frames(
     features: Tensor, cameras: Sequence[Camera], rotation: np.ndarray, position: np.ndarray
@@ -101,8 +104,9 @@ class MapNetwork(nn.Module):
         device = self.calibration.device
         for field in fields(point_map):
             kind = MAP_SHAPES[field.name][1]
-            setattr(self, field.name, torch.from_numpy(getattr(point_map, field.name)).to(device, kind))
-        numbers = [camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, camera.fisheye]
+            getattr(self, field.name).data = torch.from_numpy(getattr(point_map, field.name)).to(device, kind)
+        lens = -len(camera.distortion) if camera.lens else int(camera.fisheye)
+        numbers = [camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, lens]
         numbers += [*camera.distortion, *[0.0] * (8 - len(camera.distortion))]
         self.camera_numbers = torch.tensor(numbers, dtype=torch.float64, device=device)
         factors = [calibration.position_factor, calibration.orientation_factor]
@@ -112,14 +116,15 @@ class MapNetwork(nn.Module):
     @property
     def point_map(self) -> PointMap:
         """The map; empty before `fit`."""
-        return PointMap(**{name: getattr(self, name).cpu().numpy() for name in MAP_SHAPES})
+        return PointMap(**{name: getattr(self, name).detach().cpu().numpy() for name in MAP_SHAPES})
 
     @property
     def view(self) -> Camera:
         """The camera of queries that come without one."""
-        width, height, fx, fy, cx, cy, fisheye, *distortion = self.camera_numbers.tolist()
-        coefficients = tuple(distortion[:4] if fisheye else distortion) if any(distortion) else ()
-        return Camera(int(width), int(height), fx, fy, cx, cy, coefficients, bool(fisheye))
+        width, height, fx, fy, cx, cy, lens, *distortion = self.camera_numbers.tolist()
+        count = {0: 8, 1: 4}.get(lens, -int(lens))  # coefficients; below 0 is the number of a lens that OpenCV lacks
+        coefficients = tuple(distortion[:count]) if any(distortion) else ()
+        return Camera(int(width), int(height), fx, fy, cx, cy, coefficients, lens != 0)
 
     def locate(
         self, features: Tensor, cameras: Sequence[Camera] | None = None, prior: CameraPose | None = None

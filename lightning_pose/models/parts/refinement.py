@@ -14,7 +14,7 @@ from lightning_pose.features import AKAZE, BRIEF, FREAK, ORB, SIFT, SURF, LocalE
 from lightning_pose.mapping.map_localizer import MapAnswer
 from lightning_pose.models.parts.frame_cameras import list_cameras
 from lightning_pose.models.parts.map_builder import BundleAdjust, MapBuilder, check_bundle_adjust
-from lightning_pose.models.parts.map_network import MAP_SHAPES, MapNetwork
+from lightning_pose.models.parts.map_network import RESIZED, MapNetwork
 from lightning_pose.models.parts.memory import resize_tensors
 from lightning_pose.models.parts.world_frame import WorldFrame
 
@@ -114,7 +114,7 @@ class MapRefinement(nn.Module):
     def resize_map(self, state_dict: Mapping[str, Tensor]) -> None:
         """Give the map the size that it has in a state dict."""
         self._answers = {}
-        resize_tensors(self, (f"network.{name}" for name in MAP_SHAPES if name != "camera"), state_dict)
+        resize_tensors(self, (f"network.{name}" for name in RESIZED), state_dict)
 
 
 def _resize_before_load(module: nn.Module, state_dict: dict[str, Tensor], prefix: str, *_: object) -> None:

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import ClassVar
+
+import numpy as np
 
 from lightning_pose.scenes.formats.image_files import is_file, make_natural_key
 from lightning_pose.scenes.scene import Frame, Scene
@@ -14,6 +17,9 @@ __all__ = ["SceneFormat", "describe_bad_frames", "keep_usable"]
 
 NAMED_FRAMES = 3
 """How many unusable frames a message names; of the others it says only how many there are."""
+
+LOST_STEP = 10
+"""Tracking is taken for lost where the step to a pose that is the origin itself is so many times the usual step."""
 
 LONGEST_FAULT = 600
 """Characters of a text about one frame; names and numbers may have thousands."""
@@ -65,8 +71,11 @@ def keep_usable(
     """
     usable, bad = [], []
     order = sorted(range(len(frames)), key=lambda i: (make_natural_key(frames[i].sequence), frames[i].index))
+    lost = _find_lost_frames(frames, [i for i in order if not faults[i]])
     for i in order:
         fault, image = faults[i], frames[i].image
+        if i in lost:
+            fault = f"{image} has the pose 0 0 0 with no rotation, far from its neighbours: tracking was lost there"
         if not fault and listed_in is not None and not is_file(image):
             fault = f"{image} is missing, listed in {listed_in}; unpack it there or remove it from the list"
         if fault:
@@ -74,6 +83,35 @@ def keep_usable(
         else:
             usable.append(frames[i])
     return tuple(usable), tuple(bad)
+
+
+def _find_lost_frames(frames: Sequence[Frame], order: Sequence[int]) -> set[int]:
+    """Frames whose pose is the identity although the frames around them are elsewhere.
+
+    Trackers write the identity where they have lost the camera. A sequence may begin with it, and stay there.
+
+    Args:
+        frames: all frames.
+        order: those with a sound pose, by sequence and index.
+    """
+    at_origin = [not frames[i].position_m.any() and not frames[i].quat_wxyz[1:].any() for i in order]
+    if not any(at_origin):
+        return set()
+    position = np.array([frames[i].position_m for i in order])
+    steps = np.linalg.norm(np.diff(position, axis=0), axis=1)
+    within = np.array([frames[i].sequence == frames[j].sequence for i, j in pairwise(order)], bool)
+    moved = steps[within & (steps > 0)]
+    jump = within & (steps > LOST_STEP * np.median(moved)) if len(moved) else within & False
+    lost: set[int] = set()
+    entered = False  # by a jump to the origin, in the same sequence
+    for row, i in enumerate(order):
+        if row and (jump[row - 1] or not within[row - 1]):
+            entered = bool(jump[row - 1])
+        if at_origin[row] and entered:
+            lost.add(i)
+        elif not at_origin[row]:
+            entered = False
+    return lost
 
 
 def describe_bad_frames(scene: Scene) -> str:

@@ -21,15 +21,14 @@ from lightning_pose.scenes.formats.image_files import (
     warn_of_unlisted_images,
 )
 from lightning_pose.scenes.formats.poses import check_quats
-from lightning_pose.scenes.formats.text_files import find_column_order, find_file, parse_numbers, read_lines
+from lightning_pose.scenes.formats.text_files import find_column_order, list_files, parse_numbers, read_lines
 from lightning_pose.scenes.scene import Frame, Scene
 
 __all__ = ["FORMAT", "Cambridge"]
 
 log = logging.getLogger("lightning_pose")
 
-SPLIT_FILES = {"train": "dataset_train.txt", "test": "dataset_test.txt"}
-LISTS = " or ".join(SPLIT_FILES.values())
+SPLIT_FILE = re.compile(r"(.*?)[_-]?(train|val|validation|test)\.txt", re.IGNORECASE)
 COLUMNS = ("tx", "ty", "tz", "qw", "qx", "qy", "qz")
 MAX_DISTANCE_M = 10_000.0
 """Poses farther than this from the median position are dropped."""
@@ -37,6 +36,9 @@ MAX_DISTANCE_M = 10_000.0
 
 class Cambridge(SceneFormat):
     """`dataset_train.txt` and `dataset_test.txt`: header lines, then `image x y z qw qx qy qz`.
+
+    Lists of another name are read as well, such as `chess_train.txt` with `chess_val.txt` or `chess_test.txt`. A `val`
+    list without a `test` list is the test split.
 
     xyz is the camera centre in the world, metres; the quaternion is world-to-camera, w first unless the header gives
     another order, and is inverted here. Lines before the first that names an image are the header; there may be none.
@@ -48,16 +50,20 @@ class Cambridge(SceneFormat):
     looks_for = "dataset_train.txt and dataset_test.txt"
 
     def matches(self, root: Path) -> bool:
-        return all(find_file(root, file).is_file() for file in SPLIT_FILES.values())
+        return bool(_find_split_files(root))
 
     def read(self, root: Path) -> Scene:
-        rows = {split: _read_pose_list(find_file(root, file)) for split, file in SPLIT_FILES.items()}
-        frames, faults, split_of = _make_frames(root, rows)
+        files = _find_split_files(root)
+        if not files:
+            raise DataError(f"{root} has no {self.looks_for}; give both")
+        rows = {split: _read_pose_list(file) for split, file in files.items()}
+        lists = " or ".join(file.name for file in files.values())
+        frames, faults, split_of = _make_frames(root, rows, lists)
         kept = _keep_near_median(root, frames, faults)
-        usable, bad = keep_usable([frames[i] for i in kept], [faults[i] for i in kept], LISTS)
+        usable, bad = keep_usable([frames[i] for i in kept], [faults[i] for i in kept], lists)
         splits = {
             split: np.array([i for i, frame in enumerate(usable) if split_of[frame.image] == split], dtype=int)
-            for split in SPLIT_FILES
+            for split in files
         }
         return Scene(root.resolve().name, root, self.name, usable, splits, ground_truth="sfm", bad_frames=bad)
 
@@ -74,6 +80,32 @@ class PoseRow(NamedTuple):
     fault: str
 
 
+def _find_split_files(root: Path) -> dict[str, Path]:
+    """The lists of a folder by split, `train` and `test` and perhaps `val`; none without the first two."""
+    lists: dict[str, dict[str, Path]] = {}
+    for path in list_files(root) if root.is_dir() else []:
+        found = SPLIT_FILE.fullmatch(path.name)
+        if found and path.is_file():
+            split = "val" if found[2].lower() == "validation" else found[2].lower()
+            lists.setdefault(found[1].lower(), {})[split] = path
+    for prefix in sorted(lists, key=lambda prefix: prefix != "dataset"):
+        files = lists[prefix]
+        if "test" not in files and "val" in files:
+            files["test"] = files.pop("val")
+        if {"train", "test"} <= set(files) and (prefix == "dataset" or _lists_poses(files["train"])):
+            return {split: files[split] for split in ("train", "test", "val") if split in files}
+    return {}
+
+
+def _lists_poses(path: Path) -> bool:
+    """Whether a text file has a line of an image's path and seven numbers."""
+    try:
+        rows = (_parse_pose_row(line, "") for _, line in read_lines(path))
+        return any(not row.fault and has_image_suffix(row.image) for row in rows)
+    except DataError:
+        return False
+
+
 def _read_pose_list(path: Path) -> list[PoseRow]:
     """Read the rows of a split's file."""
     rows: list[PoseRow] = []
@@ -86,7 +118,7 @@ def _read_pose_list(path: Path) -> list[PoseRow]:
         else:
             rows.append(row._replace(numbers=row.numbers[order]))
     if not rows:
-        raise DataError(f"{path} lists no usable frame; the {path.stem[8:]} split needs at least one")
+        raise DataError(f"{path} lists no usable frame; the {path.stem.rpartition('_')[2]} split needs at least one")
     return rows
 
 
@@ -104,13 +136,15 @@ def _parse_pose_row(line: str, place: str) -> PoseRow:
     return PoseRow(image, numbers, place, "")
 
 
-def _make_frames(root: Path, rows: dict[str, list[PoseRow]]) -> tuple[list[Frame], list[str], dict[Path, str]]:
+def _make_frames(
+    root: Path, rows: dict[str, list[PoseRow]], lists: str
+) -> tuple[list[Frame], list[str], dict[Path, str]]:
     """Make the frames of both lists, with the fault of each, and find the split of each image."""
     listed = [(split, row) for split, split_rows in rows.items() for row in split_rows]
     finder = ImageFinder(root)
     images = [finder.find(row.image) for _, row in listed]
-    finder.warn(LISTS)
-    warn_of_unlisted_images(images, LISTS)
+    finder.warn(lists)
+    warn_of_unlisted_images(images, lists)
     split_of: dict[Path, str] = {}
     for image, (split, row) in zip(images, listed, strict=True):
         if image in split_of:

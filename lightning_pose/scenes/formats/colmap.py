@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import struct
 from collections.abc import Iterator, Sequence
@@ -30,10 +31,11 @@ FOLDERS = ("", "sparse", "sparse/0", "colmap/sparse/0", "colmap/sparse", "dense/
 MODEL_IDS = (
     "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",
     "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE",
+    "SIMPLE_DIVISION", "DIVISION", "SIMPLE_FISHEYE", "FISHEYE", "EUCM", "EQUIRECTANGULAR",
 )  # fmt: skip
 """COLMAP's camera models by their numbers in binary files."""
 
-OTHER_PARAMETERS = {"FOV": 5, "THIN_PRISM_FISHEYE": 12, "RAD_TAN_THIN_PRISM_FISHEYE": 16}
+OTHER_PARAMETERS = {"SIMPLE_DIVISION": 4, "DIVISION": 5, "EUCM": 6, "EQUIRECTANGULAR": 2}
 """How many parameters the models have whose distortion is not read."""
 
 
@@ -41,8 +43,9 @@ class Colmap(SceneFormat):
     """`cameras` and `images`, `.bin` or `.txt`, in `sparse/0` or beside the photos, which are in `images`.
 
     A model's poses are world-to-camera quaternions wxyz and translations; here they are inverted. Their unit is
-    arbitrary. Each frame has its own camera, with the half pixel taken off by which COLMAP counts from the corner of
-    the first pixel. A folder of photos is a sequence. Of several models, the one with the most photos is read.
+    arbitrary, unless `reconstruct` has written that it is metres. Each frame has its own camera, with the half pixel
+    taken off by which COLMAP counts from the corner of the first pixel. A folder of photos is a sequence. Of several
+    models, the one with the most photos is read.
     """
 
     name = "colmap"
@@ -86,7 +89,7 @@ class Colmap(SceneFormat):
                 )
             )
         usable, bad = keep_usable(frames, faults, path.name)
-        return Scene(name, root, self.name, usable, unit="scene", ground_truth="sfm", bad_frames=bad)
+        return Scene(name, root, self.name, usable, unit=_read_unit(root), ground_truth="sfm", bad_frames=bad)
 
 
 FORMAT = Colmap()
@@ -123,6 +126,14 @@ def _find_files(model: Path) -> tuple[Path, Path] | None:
         if cameras.is_file() and images.is_file():
             return cameras, images
     return None
+
+
+def _read_unit(root: Path) -> str:
+    """`m` where `reconstruct` has made the scene metric; else `scene`, because a model's unit is arbitrary."""
+    try:
+        return "m" if json.loads((root / "reconstruction.json").read_text(encoding="utf-8"))["unit"] == "m" else "scene"
+    except (OSError, ValueError, KeyError, TypeError):
+        return "scene"
 
 
 def _find_photo(finder: ImageFinder, listed: str) -> Path:

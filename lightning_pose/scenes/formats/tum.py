@@ -23,7 +23,7 @@ from lightning_pose.scenes.formats.poses import check_quats
 from lightning_pose.scenes.formats.text_files import NumberTable, find_file, list_files, read_lines, read_table
 from lightning_pose.scenes.scene import Frame, Intrinsics, Scene, Trajectory
 
-__all__ = ["FORMAT", "TRAJECTORY_COLUMNS", "Tum", "is_numbered", "pair_by_time"]
+__all__ = ["FORMAT", "TRAJECTORY_COLUMNS", "Tum", "convert_to_seconds", "is_numbered", "pair_by_time"]
 
 log = logging.getLogger("lightning_pose")
 
@@ -32,11 +32,14 @@ MAX_DIFFERENCE_S = 0.02
 """Largest difference in time between an image and its pose."""
 
 CAMERAS = {
-    "freiburg1": Intrinsics(517.3, 516.5, 318.6, 255.3, (640, 480), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
-    "freiburg2": Intrinsics(520.9, 521.0, 325.1, 249.7, (640, 480), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
-    "freiburg3": Intrinsics(535.4, 539.2, 320.1, 247.6, (640, 480)),  # its images are undistorted
+    "1": Intrinsics(517.3, 516.5, 318.6, 255.3, (640, 480), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    "2": Intrinsics(520.9, 521.0, 325.1, 249.7, (640, 480), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    "3": Intrinsics(535.4, 539.2, 320.1, 247.6, (640, 480)),  # its images are undistorted
 }
-"""The calibrated colour cameras of the benchmark, by a part of the folder's name."""
+"""The calibrated colour cameras of the benchmark, by their number."""
+
+CAMERA_NAME = re.compile(r"(?<![a-z])(?:freiburg|fr)([123])(?!\d)", re.IGNORECASE)
+"""How the benchmark names its recordings: `rgbd_dataset_freiburg1_rpy`, or short `fr1_rpy`."""
 
 
 class Tum(SceneFormat):
@@ -59,7 +62,7 @@ class Tum(SceneFormat):
         trajectory = find_file(root, "groundtruth.txt")
         table = read_table(trajectory, TRAJECTORY_COLUMNS)
         _warn_of_rows_without_time(trajectory, table)
-        pose_times = _convert_to_seconds(table.values[:, 0], table.header, trajectory)
+        pose_times = convert_to_seconds(table.values[:, 0], table.header, trajectory)
         _warn_of_equal_times(trajectory, pose_times)
         if _counts_frames(pose_times):
             log.warning("%s counts frames: if it is ICL-NUIM, with y up in the world, give format icl_nuim", trajectory)
@@ -78,7 +81,8 @@ class Tum(SceneFormat):
         sound = np.isfinite(pose_times) & ~np.array([bool(fault) for fault in found])
         known = Trajectory(pose_times[sound], position_m[sound], quats[sound])
         name = root.resolve().name
-        intrinsics = next((camera for key, camera in CAMERAS.items() if key in name), None)
+        camera = CAMERA_NAME.search(name)
+        intrinsics = CAMERAS[camera[1]] if camera else None
         frames = [
             Frame(listed.images[i], position, quat, name, int(i), float(listed.times[i]), intrinsics)
             for i, position, quat in zip(pairs[:, 0], position_m[rows], quats[rows], strict=True)
@@ -173,11 +177,11 @@ def _read_timed_images(root: Path, path: Path) -> ImageList:
     warn_of_unlisted_images((image for _, image in found), path.name)
     chosen = choose_listed_images(image for _, image in found)
     found = sorted(entry for entry in found if entry[1] in chosen)
-    times = _convert_to_seconds(np.array([time for time, _ in found]), header, path)
+    times = convert_to_seconds(np.array([time for time, _ in found]), header, path)
     return ImageList(times, [image for _, image in found], faults)
 
 
-def _convert_to_seconds(times: np.ndarray, header: Sequence[str], path: Path) -> np.ndarray:
+def convert_to_seconds(times: np.ndarray, header: Sequence[str], path: Path) -> np.ndarray:
     """Times in seconds, with a warning if the file has another unit.
 
     The unit is nanoseconds if the header names them. Otherwise it follows from the times: seconds since 1970 have 10

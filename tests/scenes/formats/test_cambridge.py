@@ -94,8 +94,8 @@ def test_missing_image_is_named(tmp_path: Path) -> None:
         load_scene(tmp_path)
 
 
-def test_forced_on_another_folder_names_the_missing_list(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"dataset_train.txt is missing"):
+def test_forced_on_another_folder_names_the_missing_lists(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"has no dataset_train.txt and dataset_test.txt"):
         load_scene(tmp_path, format="cambridge")
 
 
@@ -164,3 +164,34 @@ def test_lines_gone_are_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture
     with caplog.at_level(logging.WARNING, "lightning_pose"):
         load_scene(tmp_path)
     assert "1 of 3 images are not in dataset_train.txt or dataset_test.txt" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("names", "splits"),
+    [
+        (("chess_train.txt", "chess_val.txt"), {"train": 3, "val": 0, "test": 1}),
+        (("train.txt", "test.txt"), {"train": 3, "val": 0, "test": 1}),
+        (("Chess-Train.txt", "Chess-Validation.txt"), {"train": 3, "val": 0, "test": 1}),
+    ],
+)
+def test_lists_of_another_name_are_read(tmp_path: Path, names: tuple[str, str], splits: dict[str, int]) -> None:
+    write(tmp_path, TRAIN, TEST)
+    for old, new in zip(("dataset_train.txt", "dataset_test.txt"), names, strict=True):
+        (tmp_path / old).rename(tmp_path / new)
+    scene = load_scene(tmp_path, val_fraction=0)
+    assert {split: len(rows) for split, rows in scene.splits.items()} == splits
+
+
+def test_val_list_beside_a_test_list_is_the_validation_split(tmp_path: Path) -> None:
+    write(tmp_path, TRAIN, TEST)
+    (tmp_path / "dataset_val.txt").write_text(HEADER + "seq3/frame00001.png 1 1 1 1 0 0 0\n")
+    make_image(tmp_path / "seq3/frame00001.png")
+    scene = load_scene(tmp_path)
+    assert [scene.frames[i].sequence for i in scene.splits["val"]] == ["seq3"]
+
+
+def test_lists_without_poses_are_not_of_this_format(tmp_path: Path) -> None:
+    for name in ("train.txt", "test.txt"):
+        (tmp_path / name).write_text("a.png\nb.png\n")
+    with pytest.raises(DataError, match="known format"):
+        load_scene(tmp_path)

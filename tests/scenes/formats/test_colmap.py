@@ -99,11 +99,20 @@ def test_photos_in_folders_are_sequences(root: Path) -> None:
 def test_a_lens_that_is_not_read_leaves_the_camera_unknown(root: Path, caplog: pytest.LogCaptureFixture) -> None:
     write_text(root / "sparse")
     cameras = root / "sparse" / "cameras.txt"
-    cameras.write_text(cameras.read_text().replace("7 OPENCV_FISHEYE", "7 THIN_PRISM_FISHEYE"))
+    cameras.write_text(cameras.read_text().replace("7 OPENCV_FISHEYE", "7 EUCM"))
     with caplog.at_level(logging.WARNING, "lightning_pose"):
         scene = load_scene(root, val_fraction=0, test_fraction=0)
     assert scene.frames[1].intrinsics is None
-    assert "camera 7 is of model THIN_PRISM_FISHEYE, whose distortion is not read; undistort the photos" in caplog.text
+    assert "camera 7 is of model EUCM, whose distortion is not read; undistort the photos" in caplog.text
+
+
+def test_lenses_that_opencv_does_not_have_are_read(root: Path) -> None:
+    write_text(root / "sparse")
+    cameras = root / "sparse" / "cameras.txt"
+    cameras.write_text("1 FOV 640 480 300 300 320 240 0.9\n7 THIN_PRISM_FISHEYE 800 600 1 2 3 4 1 2 3 4 5 6 7 8\n")
+    first, second = (frame.intrinsics for frame in load_scene(root, val_fraction=0, test_fraction=0).frames)
+    assert first == Intrinsics(300, 300, 319.5, 239.5, (640, 480), (0.9,), fisheye=True)
+    assert second == Intrinsics(1, 2, 2.5, 3.5, (800, 600), (1, 2, 3, 4, 5, 6, 7, 8), fisheye=True)
 
 
 def test_missing_photos_are_named(root: Path) -> None:

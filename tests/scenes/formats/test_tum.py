@@ -27,6 +27,18 @@ def write(root: Path, image_times: list[float], rows: list[str]) -> Path:
     return root
 
 
+@pytest.mark.parametrize(
+    ("name", "fx"),
+    [("fr1_rpy", 517.3), ("fr2-desk", 520.9), ("rgbd_dataset_freiburg3_office", 535.4), ("fr10", None), ("afr1", None)],
+)
+def test_the_folder_names_the_camera(name: str, fx: float | None, tmp_path: Path) -> None:
+    scene = load_scene(
+        write(tmp_path / name, [100.0, 100.1, 100.2], [f"{t} 0 0 0 0 0 0 1" for t in (100.0, 100.1, 100.2)])
+    )
+    intrinsics = scene.frames[0].intrinsics
+    assert (intrinsics and intrinsics.fx) == fx
+
+
 def test_pose_and_order_of_the_quaternion(tmp_path: Path) -> None:
     root = tmp_path / "rgbd_dataset_freiburg1_desk"
     rows = ["100.1 4 5 6 0 0 0 1", "100.004 1 2 3 0.1 0.1 0.7 0.7", "100.2 0 0 0 0 0 0 -1"]
@@ -210,3 +222,23 @@ def test_hololens_office() -> None:
     assert sizes == {"train": 268, "val": 30, "test": 75}
     np.testing.assert_allclose(scene.frames[0].position_m, [-1.943120, 0.112344, 4.679990])
     np.testing.assert_allclose(scene.frames[0].quat_wxyz, [0.150952, 0.793430, -0.122476, 0.576786], atol=1e-5)
+
+
+def walk(count: int, lost: range, start: float = 1.0) -> list[str]:
+    """Poses of a walk along x, the identity where tracking is lost."""
+    places = ["0 0 0" if i in lost else f"{start + 0.02 * i} 0 0" for i in range(count)]
+    return [f"{100 + i / 10:.1f} {place} 0 0 0 1" for i, place in enumerate(places)]
+
+
+@pytest.mark.parametrize("lost", [range(8, 12), range(9, 10), range(16, 20)])
+def test_identity_where_tracking_was_lost_is_no_pose(lost: range, tmp_path: Path) -> None:
+    root = write(tmp_path / "walk", [100 + i / 10 for i in range(20)], walk(20, lost))
+    with pytest.raises(DataError, match=rf"{len(lost)} of 20 frames cannot be used.*tracking was lost"):
+        load_scene(root)
+    assert len(load_scene(root, on_bad_frame="drop").frames) == 20 - len(lost)
+
+
+@pytest.mark.parametrize(("lost", "start"), [(range(4), 1.0), (range(8, 12), -0.18), (range(20), 0.0)])
+def test_a_walk_may_begin_at_the_origin_and_pass_it(lost: range, start: float, tmp_path: Path) -> None:
+    root = write(tmp_path / "walk", [100 + i / 10 for i in range(20)], walk(20, lost, start))
+    assert len(load_scene(root).frames) == 20
