@@ -124,9 +124,9 @@ class Localizer:
                 as `localize_video` does, which type checkers should be shown.
             camera: of all images, scaled to each, for systems with a map; in COLMAP's notation, as `data.camera` has
                 it. That of the training images if not given.
-            prior: where the camera is thought to be, for systems with a map. The points that the image should show
-                there are matched first. A pose near it, within half the median depth of the map's points and 30
-                degrees, is accepted with 12 inliers in place of 20; a pose that is not near it is refused.
+            prior: where the camera is thought to be, for systems with a map. A pose that is not within half the median
+                depth of the map's points and 30 degrees of it is refused. Where the map finds none, the points that
+                the image should show there are matched.
 
         Returns:
             a pose, or a list of poses for a list.
