@@ -23,6 +23,8 @@ from scipy.spatial.transform import Rotation
 from lightning_pose.data.datamodule import room_folder
 from lightning_pose.figures.style import MODEL, STYLE, TRAINING, TRUTH
 from lightning_pose.localization.localizer import Localizer
+from lightning_pose.localization.located_pose import stack_poses
+from lightning_pose.localization.trained_system import TrainedSystem
 from lightning_pose.scenes.formats import load_scene
 from lightning_pose.scenes.scene import Scene
 from lightning_pose.scenes.synthetic.room import make_room
@@ -126,11 +128,11 @@ def main() -> None:
     parser.add_argument("picture", type=Path)
     args = parser.parse_args()
     scene = load_scene(room_folder(seed=0, frames=300))
-    localizer = Localizer.from_checkpoint(args.checkpoint)
+    system = TrainedSystem.from_checkpoint(args.checkpoint)
     images = [scene.frames[i].image for i in scene.splits["test"]]
-    refined = localizer(images)
-    localizer.model.refinement = None
-    alone_m, _ = localizer(images)
+    refined = stack_poses(Localizer(system).localize(images))
+    system.model.refinement = None
+    alone_m, _ = stack_poses(Localizer(system).localize(images))
     drawn = io.BytesIO()
     draw_picture(scene, refined, alone_m).savefig(drawn)
     Image.open(drawn).convert("RGB").quantize(COLORS).save(args.picture, optimize=True)

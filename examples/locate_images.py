@@ -7,8 +7,8 @@ It writes the room to `room/`, and runs and checkpoints to `mlruns/`, in the cur
 
 from pathlib import Path
 
+from lightning_pose import Localizer
 from lightning_pose.__main__ import main
-from lightning_pose.localization.localizer import Localizer
 from lightning_pose.scenes.formats import load_scene
 from lightning_pose.scenes.synthetic import render_room
 
@@ -22,12 +22,12 @@ def locate_images() -> None:
         raise SystemExit("fit has failed")
     checkpoints = Path("mlruns/checkpoints").glob("*/best.ckpt")
     newest = max(checkpoints, key=lambda path: path.stat().st_mtime)
-    localizer = Localizer.from_checkpoint(newest)
+    localizer = Localizer.load(newest)
     scene = load_scene(room)
     frames = [scene.frames[i] for i in scene.splits["test"][:3]]
-    position_m, _quat_wxyz = localizer([frame.image for frame in frames])
-    for frame, position in zip(frames, position_m, strict=True):
-        print(f"{frame.image.name}: true {frame.position_m.round(2)}, predicted {position.round(2)}")
+    poses = localizer.localize([frame.image for frame in frames])
+    for frame, pose in zip(frames, poses, strict=True):
+        print(f"{frame.image.name}: true {frame.position_m.round(2)}, predicted {pose.position_m.round(2)}")
 
 
 if __name__ == "__main__":

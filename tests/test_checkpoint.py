@@ -62,9 +62,9 @@ def test_a_checkpoint_of_version_0_1_answers_as_it_did(
     assert raw["model"]["class_path"] == "lightning_pose.models.surf_lstm.SurfLSTM"
     random = np.random.default_rng(0).uniform(0, 255, (12, 16)).astype(np.float32)
     image = cv2.resize(random, (160, 120), interpolation=cv2.INTER_CUBIC).clip(0, 255).astype(np.uint8)
-    answer = Localizer.from_checkpoint(CHECKPOINTS / file)([image])
-    np.testing.assert_allclose(answer[0][0], position_m, atol=1e-4)
-    np.testing.assert_allclose(answer[1][0], quat_wxyz, atol=1e-4)
+    answer = Localizer.load(CHECKPOINTS / file).localize(image)
+    np.testing.assert_allclose(answer.position_m, position_m, atol=1e-4)
+    np.testing.assert_allclose(answer.quat_wxyz, quat_wxyz, atol=1e-4)
 
 
 def test_every_renamed_class_exists() -> None:

@@ -15,6 +15,7 @@ import yaml
 from lightning_pose.cli import PoseCLI
 from lightning_pose.data import ImageDataModule
 from lightning_pose.localization.localizer import Localizer
+from lightning_pose.localization.located_pose import stack_poses
 from lightning_pose.sweeps.base_config import resolve_config
 from tests.helpers import Trained, Workplace
 
@@ -193,7 +194,7 @@ def test_predict_writes_what_the_model_says(
     (line,) = capsys.readouterr().out.splitlines()
     rows = np.loadtxt(workplace.folder / line)
     images = sorted((workplace.scene / "seq-03").glob("*.png"))
-    position_m, quat_wxyz = Localizer.from_checkpoint(trained.best, allow="tests")(images)
+    position_m, quat_wxyz = stack_poses(Localizer.load(trained.best, allow="tests").localize(images))
     np.testing.assert_array_equal(rows[:, 0], np.arange(10))
     np.testing.assert_allclose(rows[:, 1:4], position_m, atol=1e-5)
     np.testing.assert_allclose(rows[:, [7, 4, 5, 6]], quat_wxyz, atol=1e-5)

@@ -12,6 +12,7 @@ import yaml
 from lightning_pose.geometry.quaternions import orientation_error_deg, position_error_m
 from lightning_pose.geometry.relative import absolute_poses
 from lightning_pose.localization.localizer import Localizer
+from lightning_pose.localization.located_pose import stack_poses
 from tests.helpers import Trained, Workplace, write_scene
 
 
@@ -67,9 +68,8 @@ def test_standing_still_is_as_wrong_as_the_truth_moves(clip_run: Trained) -> Non
 
 def test_the_localizer_chains_a_video(clip_run: Trained) -> None:
     images = sorted((clip_run.workplace.scene / "seq-03").glob("*.png"))
-    position_m, quat_wxyz = (
-        torch.from_numpy(part) for part in Localizer.from_checkpoint(clip_run.best, allow="tests")(images)
-    )
+    poses = Localizer.load(clip_run.best, allow="tests").localize(images)
+    position_m, quat_wxyz = map(torch.from_numpy, stack_poses(poses))
     truth, kept = (torch.from_numpy(trajectory(clip_run, name)) for name in ("truth", "predictions"))
     placed = absolute_poses(position_m, quat_wxyz, truth[0, 1:4], truth[0, [7, 4, 5, 6]])
     torch.testing.assert_close(placed[0], kept[:, 1:4], atol=1e-4, rtol=0)

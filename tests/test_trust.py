@@ -15,6 +15,7 @@ import torch
 from lightning_pose.checkpoint import build_object, read_checkpoint
 from lightning_pose.errors import CheckpointError
 from lightning_pose.localization.localizer import Localizer
+from lightning_pose.localization.trained_system import TrainedSystem
 from tests.helpers import Trained
 
 CHECKPOINT = Path(__file__).parent / "checkpoints" / "surf_lstm_0_1.ckpt"
@@ -96,7 +97,7 @@ def test_a_stranger_s_checkpoint_runs_nothing(
 ) -> None:
     file = write_checkpoint(tmp_path, **changes)
     with pytest.raises(CheckpointError):
-        Localizer.from_checkpoint(file)
+        Localizer.load(file)
     for verb in ("predict", "test", "validate"):
         assert trained.workplace.command(verb, "--ckpt_path", file, allow=()) == 2
     assert not marker.exists()
@@ -107,11 +108,11 @@ def test_a_stranger_s_checkpoint_runs_nothing(
 def test_a_refused_class_is_named_with_the_remedy(marker: Path, tmp_path: Path) -> None:
     file = write_checkpoint(tmp_path, model__class_path="evil_pose.Net")
     with pytest.raises(CheckpointError, match=r"names evil_pose.Net, which is not .*--allow evil_pose.Net, or in Py"):
-        Localizer.from_checkpoint(file)
+        Localizer.load(file)
     with pytest.raises(CheckpointError, match=r"names evil_pose\.Net"):
-        Localizer.from_checkpoint(file, allow=["evil"])
+        Localizer.load(file, allow=["evil"])
     for allow in ("evil_pose.Net", ["evil_pose"]):
-        assert type(Localizer.from_checkpoint(file, allow=allow).model).__name__ == "Net"
+        assert type(TrainedSystem.from_checkpoint(file, allow=allow).model).__name__ == "Net"
     assert marker.exists()
 
 

@@ -40,9 +40,9 @@ GRAY = 160
 def main(argv: list[str]) -> int:
     """Run the command with the arguments after its name; return the exit code."""
     args = _build_parser().parse_args(argv)
-    from lightning_pose.localization.localizer import Localizer  # Lightning, which takes seconds to import
+    from lightning_pose.localization.trained_system import TrainedSystem  # torch, which takes seconds to import
 
-    model = Localizer.from_checkpoint(args.checkpoint, args.allow or ()).model
+    model = TrainedSystem.from_checkpoint(args.checkpoint, args.allow or ()).model
     network = model.map_network
     if network is None:
         raise ConfigError(

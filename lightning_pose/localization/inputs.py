@@ -1,97 +1,149 @@
-"""What a localizer is given: image files and arrays, and in one line what is neither."""
+"""What a localizer is given: image files, arrays and PIL images, and in one line what is none of these."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import io
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
+from PIL import Image
 
 from lightning_pose.errors import ConfigError, ImageError
-from lightning_pose.features.base import FeatureExtractor
-from lightning_pose.geometry.camera import Camera
-from lightning_pose.scenes.cameras import scale_camera
+from lightning_pose.scenes.images import decode_image, read_bytes, to_gray
 
-__all__ = ["enlarge_images", "read_images"]
+__all__ = ["ImageInput", "LoadedImage", "is_video", "list_images", "load_image"]
+
+ImageInput = str | Path | np.ndarray | Image.Image
+"""One image: a file, a uint8 array (H, W) gray or (H, W, 3) RGB, or a PIL image."""
+
+Color = Literal["gray", "rgb"]
 
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv", ".3gp")
 
-MIN_ENLARGEMENT, MAX_ENLARGEMENT = 1.2, 4.0
-"""By how much images are enlarged at least, and at most."""
+REMEDY = "give an image file, a uint8 array, a PIL image, or a list of these"
 
-REMEDY = "give an image file, a uint8 array, or a list of these"
+ORIENTATION_TAG, EXIF_FOLDER, FOCAL_35MM_TAG = 0x0112, 0x8769, 0xA405
+"""Tags of EXIF: the orientation, where the camera's own tags are, and the focal length on film of 36 x 24 mm."""
 
 
-def read_images(images: object, extractor: FeatureExtractor) -> list[np.ndarray]:
-    """The images as arrays that the extractor reads; one that stands alone is a list of one.
+@dataclass(frozen=True)
+class LoadedImage:
+    """An image as an extractor reads it.
+
+    Attributes:
+        array: (H, W) or (H, W, 3) uint8, pixels as stored.
+        name: its path as given; None for an image in memory.
+        orientation: of EXIF, 1 to 8; 1 if it has none.
+        focal_35mm: focal length in millimetres on film of 36 x 24 mm, as EXIF has it; None if it does not.
+    """
+
+    array: np.ndarray
+    name: str | None = None
+    orientation: int = 1
+    focal_35mm: float | None = None
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in pixels."""
+        return self.array.shape[1], self.array.shape[0]
+
+    def turn(self, quarters: int) -> LoadedImage:
+        """The image turned clockwise by so many quarters, without its EXIF orientation."""
+        return replace(self, array=np.ascontiguousarray(np.rot90(self.array, -quarters)), orientation=1)
+
+
+def is_video(path: str | Path) -> bool:
+    """Whether a path has a video file's ending."""
+    return Path(path).suffix.lower() in VIDEO_SUFFIXES
+
+
+def list_images(images: object) -> Sequence[object] | None:
+    """The images of a list, tuple or other iterable; None for what is one image.
 
     Raises:
-        ConfigError: it is something else, or an array of another shape or type than the extractor reads.
-        ImageError: a file is missing, is a folder or a video, or cannot be read.
+        ConfigError: it is neither.
     """
-    axes = 2 if extractor.color == "gray" else 3
-    if isinstance(images, str | Path) or (isinstance(images, np.ndarray) and images.ndim == axes):
-        images = [images]
+    if isinstance(images, str | Path | Image.Image) or _is_image_array(images):
+        return None
     if isinstance(images, bytes | dict) or not isinstance(images, Iterable):
         raise ConfigError(f"images is {_describe(images)}; {REMEDY}")
-    return [_read_image(image, i, extractor, axes) for i, image in enumerate(images)]
+    return list(images)
 
 
-def _read_image(image: object, number: int, extractor: FeatureExtractor, axes: int) -> np.ndarray:
-    """One image as an array."""
+def load_image(image: object, color: Color, number: int = 0) -> LoadedImage:
+    """Read or convert one image.
+
+    Args:
+        image: what should be an `ImageInput`.
+        color: what the extractor reads.
+        number: of the image in its list, for messages.
+
+    Raises:
+        ConfigError: it is something else, or an array of another shape or type.
+        ImageError: a file is missing, is a folder or a video, or cannot be read.
+    """
     if isinstance(image, str | Path):
-        path = Path(image).expanduser()
-        if path.is_dir():
-            raise ImageError(
-                f"{image} is a folder; give its images, such as sorted(Path({str(image)!r}).glob('*.png'))"
-            )
-        if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file():
-            raise ImageError(f"{image} is a video; give its frames as a list of arrays")
-        return extractor.read(path)
+        return _read_file(image, color)
+    if isinstance(image, Image.Image):
+        orientation, focal = _read_exif(image)
+        return LoadedImage(_convert_color(np.asarray(image.convert("RGB")), color), None, orientation, focal)
     if not isinstance(image, np.ndarray):
         raise ConfigError(f"image {number} is {_describe(image)}; {REMEDY}")
-    if image.ndim != axes or image.dtype != np.uint8 or not image.size or (axes == 3 and image.shape[2] != 3):
-        wanted = "(H, W) gray" if axes == 2 else "(H, W, 3) RGB"
+    if not _is_image_array(image) or image.dtype != np.uint8 or not image.size:
         raise ConfigError(
-            f"image {number} is an array of shape {image.shape} and type {image.dtype}; {extractor.name} reads uint8 "
-            f"{wanted} images"
+            f"image {number} is an array of shape {image.shape} and type {image.dtype}; give uint8 of shape (H, W) "
+            "gray or (H, W, 3) RGB"
         )
-    return image
+    return LoadedImage(_convert_color(image, color))
+
+
+def _is_image_array(value: object) -> bool:
+    return isinstance(value, np.ndarray) and (value.ndim == 2 or (value.ndim == 3 and value.shape[2] == 3))
+
+
+def _convert_color(array: np.ndarray, color: Color) -> np.ndarray:
+    """Pixels (H, W) or (H, W, 3) as the extractor reads them."""
+    if color == "gray":
+        return to_gray(array)
+    return array if array.ndim == 3 else cv2.cvtColor(array, cv2.COLOR_GRAY2RGB)
+
+
+def _read_file(image: str | Path, color: Color) -> LoadedImage:
+    """An image file with what its EXIF block says."""
+    path = Path(image).expanduser()
+    if path.is_dir():
+        raise ImageError(f"{image} is a folder; give its images, such as sorted(Path({str(image)!r}).glob('*.png'))")
+    if is_video(path) and path.is_file():
+        raise ImageError(f"{image} is a video among images; give it alone")
+    data = read_bytes(path)
+    array = decode_image(data, path, color == "rgb")
+    try:
+        with Image.open(io.BytesIO(data)) as opened:
+            orientation, focal = _read_exif(opened)
+    except (OSError, ValueError, Image.DecompressionBombError):  # OpenCV reads more formats
+        orientation, focal = 1, None
+    return LoadedImage(array, str(image), orientation, focal)
+
+
+def _read_exif(image: Image.Image) -> tuple[int, float | None]:
+    """The orientation, 1 to 8, and the focal length on film of 36 x 24 mm, in millimetres."""
+    try:
+        exif = image.getexif()
+        orientation, focal = exif.get(ORIENTATION_TAG, 1), exif.get_ifd(EXIF_FOLDER).get(FOCAL_35MM_TAG)
+        focal = None if focal is None else float(focal)
+    except (ValueError, TypeError, KeyError, SyntaxError, OSError, ZeroDivisionError):  # a damaged block says nothing
+        return 1, None
+    return (
+        orientation if orientation in range(1, 9) else 1,
+        focal if focal is not None and 1 <= focal <= 2000 else None,
+    )
 
 
 def _describe(value: object) -> str:
     """A value's type and beginning, for a message."""
     text = repr(value)
     return f"{text if len(text) <= 40 else text[:40] + '...'} ({type(value).__name__})"
-
-
-def enlarge_images(arrays: list[np.ndarray], view: Camera, camera: Camera | None) -> list[np.ndarray]:
-    """Images in which a pixel is as small an angle as in a map's images; the same list where none is too small.
-
-    Keypoints of small images are too few and too uncertain for a map of larger ones: in images of half the size they
-    locate three times worse, and in the same images enlarged as well as in the large ones.
-
-    Args:
-        arrays: (H, W) or (H, W, 3).
-        view: the camera of the map's images.
-        camera: of these images, scaled to each; `view` if None.
-
-    Raises:
-        ConfigError: an image has another shape than those that the camera is for.
-    """
-    known = view if camera is None else camera
-    factors = [
-        view.focal_px / scale_camera(known, array.shape[1], array.shape[0], setting="camera").focal_px
-        for array in arrays
-    ]
-    if max(factors) < MIN_ENLARGEMENT:
-        return arrays
-    enlarged = []
-    for array, factor in zip(arrays, factors, strict=True):
-        if factor >= MIN_ENLARGEMENT:
-            factor = min(factor, MAX_ENLARGEMENT)
-            size = round(array.shape[1] * factor), round(array.shape[0] * factor)
-            array = cv2.resize(array, size, interpolation=cv2.INTER_CUBIC)
-        enlarged.append(array)
-    return enlarged

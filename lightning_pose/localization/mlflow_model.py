@@ -13,6 +13,7 @@ from mlflow.models import set_model
 from mlflow.pyfunc.model import PythonModel, PythonModelContext
 
 from lightning_pose.localization.localizer import Localizer
+from lightning_pose.localization.located_pose import stack_poses
 
 __all__ = ["LocalizerModel"]
 
@@ -25,7 +26,7 @@ class LocalizerModel(PythonModel):
     def load_context(self, context: PythonModelContext) -> None:
         # `fit` says here which classes of the user's own it trained; the checkpoint itself is not believed.
         allow = (context.model_config or {}).get("allow", ())
-        self.localizer = Localizer.from_checkpoint(context.artifacts["checkpoint"], allow)
+        self.localizer = Localizer.load(context.artifacts["checkpoint"], allow)
 
     def predict(
         self, context: PythonModelContext | None, model_input: list[str], params: dict[str, Any] | None = None
@@ -40,7 +41,9 @@ class LocalizerModel(PythonModel):
         Returns:
             One row an image: camera centre in metres and camera-to-world quaternion.
         """
-        return pd.DataFrame(np.hstack(self.localizer(model_input)), columns=pd.Index(COLUMNS))
+        return pd.DataFrame(
+            np.hstack(stack_poses(self.localizer.localize(list(model_input)))), columns=pd.Index(COLUMNS)
+        )
 
 
 set_model(LocalizerModel())

@@ -11,6 +11,8 @@ from lightning_pose.data import ImageDataModule
 from lightning_pose.errors import ConfigError
 from lightning_pose.features import SURF
 from lightning_pose.localization.localizer import Localizer
+from lightning_pose.localization.located_pose import stack_poses
+from lightning_pose.localization.trained_system import TrainedSystem
 from lightning_pose.models import LandmarkMap
 from lightning_pose.scenes.images import read_gray
 from lightning_pose.scenes.synthetic import render_room
@@ -31,7 +33,7 @@ def located(tmp_path_factory: pytest.TempPathFactory) -> tuple[Localizer, list[n
     trainer.fit(model, datamodule=data)
     frames = [data.scene.frames[i] for i in data.scene.splits["test"]]
     images = [read_gray(frame.image) for frame in frames]
-    return Localizer(extractor, model), images, np.array([frame.position_m for frame in frames])
+    return Localizer(TrainedSystem(extractor, model)), images, np.array([frame.position_m for frame in frames])
 
 
 def test_half_and_double_size(located: tuple[Localizer, list[np.ndarray], np.ndarray]) -> None:
@@ -39,18 +41,19 @@ def test_half_and_double_size(located: tuple[Localizer, list[np.ndarray], np.nda
     error_m = {}
     for factor, filter_ in ((1.0, cv2.INTER_AREA), (0.5, cv2.INTER_AREA), (2.0, cv2.INTER_CUBIC)):
         resized = [cv2.resize(image, None, fx=factor, fy=factor, interpolation=filter_) for image in images]
-        error_m[factor] = np.median(np.linalg.norm(localizer(resized)[0] - truth_m, axis=1))
+        error_m[factor] = np.median(np.linalg.norm(stack_poses(localizer.localize(resized))[0] - truth_m, axis=1))
     assert error_m[1.0] < 0.03
     assert max(error_m.values()) < 2 * error_m[1.0]
 
 
 def test_a_part_of_an_image_needs_its_camera(located: tuple[Localizer, list[np.ndarray], np.ndarray]) -> None:
     localizer, images, truth_m = located
-    view = localizer.model.map_network.view  # type: ignore[union-attr]
+    view = localizer.system.view
+    assert view is not None
     parts = [image[20:220, 40:280] for image in images]
     camera = f"PINHOLE,240,200,{view.fx},{view.fy},{view.cx - 40},{view.cy - 20}"
-    assert np.median(np.linalg.norm(localizer(parts, camera=camera)[0] - truth_m, axis=1)) < 0.05
+    assert np.median(np.linalg.norm(stack_poses(localizer.localize(parts, camera=camera))[0] - truth_m, axis=1)) < 0.05
     with pytest.raises(
         ConfigError, match=r"240x200 pixels, and its camera is for 320x240.*give camera for its own size"
     ):
-        localizer(parts)
+        localizer.localize(parts)

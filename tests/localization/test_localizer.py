@@ -7,17 +7,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from lightning_pose.checkpoint import read_checkpoint
 from lightning_pose.errors import CheckpointError, ConfigError, ImageError
 from lightning_pose.localization.localizer import Localizer
+from lightning_pose.localization.located_pose import stack_poses
+from lightning_pose.localization.trained_system import TrainedSystem
 from lightning_pose.scenes.images import read_gray
 from tests.helpers import Thumbnails, Trained
 
 
 @pytest.fixture
 def localizer(trained: Trained) -> Localizer:
-    return Localizer.from_checkpoint(trained.best, allow="tests")
+    return Localizer.load(trained.best, allow="tests")
 
 
 @pytest.fixture
@@ -32,7 +35,7 @@ def test_a_checkpoint_is_plain_and_whole(trained: Trained) -> None:
 
 
 def test_it_locates_as_the_test_did(localizer: Localizer, images: list[Path], trained: Trained) -> None:
-    position_m, quat_wxyz = localizer(images)
+    position_m, quat_wxyz = stack_poses(localizer.localize(images))
     kept = trained.workplace.client.download_artifacts(trained.run.info.run_id, "trajectories/predictions/seq-03.tum")
     rows = np.loadtxt(kept)
     np.testing.assert_allclose(position_m, rows[:, 1:4], atol=1e-5)
@@ -41,21 +44,23 @@ def test_it_locates_as_the_test_did(localizer: Localizer, images: list[Path], tr
 
 
 def test_files_names_and_arrays_are_one(localizer: Localizer, images: list[Path]) -> None:
-    from_files = localizer(images[:2])
-    from_mixed = localizer([str(images[0]), read_gray(images[1])])
+    from_files = stack_poses(localizer.localize(images[:2]))
+    from_mixed = stack_poses(localizer.localize([str(images[0]), read_gray(images[1])]))
     for a, b in zip(from_files, from_mixed, strict=True):
         np.testing.assert_array_equal(a, b)
 
 
 def test_it_does_not_learn(localizer: Localizer, images: list[Path]) -> None:
-    assert isinstance(localizer.extractor, Thumbnails)
-    assert not localizer.model.training
-    np.testing.assert_array_equal(localizer(images[:1])[0], localizer(images[:1])[0])
+    assert isinstance(localizer.system, TrainedSystem)
+    assert isinstance(localizer.system.extractor, Thumbnails)
+    assert not localizer.system.model.training
+    first, second = localizer.localize([images[0], images[0]])
+    np.testing.assert_array_equal(first.position_m, second.position_m)
 
 
 def test_an_image_that_is_missing(localizer: Localizer) -> None:
     with pytest.raises(ImageError, match=r"nowhere.png does not exist; check"):
-        localizer(["nowhere.png"])
+        localizer.localize(["nowhere.png"])
 
 
 @pytest.mark.parametrize(
@@ -65,22 +70,22 @@ def test_an_image_that_is_missing(localizer: Localizer) -> None:
         (7, r"images is 7 \(int\)"),
         (b"a.png", r"images is b'a.png' \(bytes\)"),
         ([None], r"image 0 is None \(NoneType\)"),
-        (np.zeros((4, 5), np.float32), r"shape \(4, 5\) and type float32; thumbnails reads uint8 \(H, W\) gray"),
-        ([np.zeros((4, 5, 3), np.uint8)], r"shape \(4, 5, 3\) and type uint8"),
+        (np.zeros((4, 5), np.float32), r"shape \(4, 5\) and type float32; give uint8 of shape \(H, W\) gray"),
+        ([np.zeros((4, 5, 4), np.uint8)], r"shape \(4, 5, 4\) and type uint8"),
         (np.zeros((0, 5), np.uint8), r"shape \(0, 5\)"),
     ],
 )
 def test_what_is_no_image_is_refused_in_one_line(localizer: Localizer, images: object, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        localizer(images)  # pyright: ignore[reportArgumentType]
+        localizer.localize(images)  # pyright: ignore[reportCallIssue, reportArgumentType]
 
 
 def test_folders_and_videos_are_refused(localizer: Localizer, tmp_path: Path) -> None:
     with pytest.raises(ImageError, match=r"is a folder; give its images"):
-        localizer(tmp_path)
+        localizer.localize(tmp_path)
     (tmp_path / "walk.MP4").write_bytes(b"video")
-    with pytest.raises(ImageError, match=r"walk.MP4 is a video; give its frames"):
-        localizer(str(tmp_path / "walk.MP4"))
+    with pytest.raises(ImageError, match=r"walk.MP4 is a video among images"):
+        localizer.localize([str(tmp_path / "walk.MP4")])
 
 
 @pytest.mark.parametrize("content", [b"", b"garbage", b"PK\x03\x04 a broken archive"])
@@ -96,17 +101,19 @@ def test_a_checkpoint_without_data(trained: Trained, tmp_path: Path) -> None:
     checkpoint["lightning_pose"]["data"] = None
     torch.save(checkpoint, tmp_path / "model.ckpt")
     with pytest.raises(CheckpointError, match=r"model.ckpt does not say which features it reads; train with"):
-        Localizer.from_checkpoint(tmp_path / "model.ckpt")
+        Localizer.load(tmp_path / "model.ckpt")
 
 
 def test_one_image_may_stand_alone(localizer: Localizer, images: list[Path]) -> None:
-    expected = localizer(images[:1])
-    for image in (images[0], str(images[0]), read_gray(images[0])):
-        for found, right in zip(localizer(image), expected, strict=True):
-            np.testing.assert_array_equal(found, right)
+    (expected,) = localizer.localize(images[:1])
+    in_color = Image.open(images[0]).convert("RGB")
+    for image in (images[0], str(images[0]), read_gray(images[0]), in_color, np.asarray(in_color)):
+        pose = localizer.localize(image)
+        np.testing.assert_array_equal(pose.position_m, expected.position_m)
+        np.testing.assert_array_equal(pose.quat_wxyz, expected.quat_wxyz)
     with pytest.raises(ImageError, match=r"^a\.png does not exist"):
-        localizer("a.png")
+        localizer.localize("a.png")
 
 
 def test_no_image_has_no_pose(localizer: Localizer) -> None:
-    assert [part.shape for part in localizer([])] == [(0, 3), (0, 4)]
+    assert localizer.localize([]) == []

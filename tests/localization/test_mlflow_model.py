@@ -12,6 +12,7 @@ import pytest
 from mlflow.pyfunc import PyFuncModel  # type: ignore[attr-defined]
 
 from lightning_pose.localization.localizer import Localizer
+from lightning_pose.localization.located_pose import stack_poses
 from tests.helpers import REPOSITORY, Trained
 
 COLUMNS = ["x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"]
@@ -28,7 +29,7 @@ def test_a_row_for_each_image(as_table: bool, model: PyFuncModel, trained: Train
     images = [str(image) for image in sorted((scene / "seq-03").glob("*.png"))]
     poses = model.predict(pd.DataFrame({"image": images}) if as_table else images)
     assert list(poses.columns) == COLUMNS
-    position_m, quat_wxyz = Localizer.from_checkpoint(trained.best, allow="tests")(images)
+    position_m, quat_wxyz = stack_poses(Localizer.load(trained.best, allow="tests").localize(images))
     np.testing.assert_allclose(poses.to_numpy(), np.hstack([position_m, quat_wxyz]))
 
 
@@ -49,7 +50,7 @@ def test_the_docs_load_it_in_a_copied_project(
     code = page.split("```python\n")[1].split("```")[0].replace("RUN_ID", run).replace("image.jpg", image)
     names: dict[str, pd.DataFrame] = {}
     exec(code, names)
-    expected = np.hstack(Localizer.from_checkpoint(trained.best, allow="tests")([image]))
+    expected = np.hstack(stack_poses(Localizer.load(trained.best, allow="tests").localize([image])))
     np.testing.assert_allclose(names["poses"].to_numpy(), expected)
     place = mlflow.get_run(run).info.artifact_uri
     assert str(place).startswith((tmp_path / "copy" / "mlruns" / "artifacts").as_uri())

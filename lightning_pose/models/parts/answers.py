@@ -33,6 +33,11 @@ class Answers:
         reason: why the map refuses; empty where it accepts, and where there is none.
         radius_m: (M,), around each position, holds 90 % of errors; nan where it is unknown, inf where refused.
         radius_deg: (M,), the same of orientations.
+        inliers: (M,) int64, matches of the map within 3 px; -1 where there is no map.
+        visible: (M,) int64, points of the map that the image should show; -1 where there is no map.
+        covariance: (M, 6, 6), of x, y, z in the scene's unit and of rotations about the world's axes in rad; nan where
+            no map has a pose. It is that of the image errors, scaled until its 90 % spheres are the radii, where these
+            are known.
     """
 
     position_m: np.ndarray
@@ -41,6 +46,9 @@ class Answers:
     reason: tuple[str, ...]
     radius_m: np.ndarray
     radius_deg: np.ndarray
+    inliers: np.ndarray
+    visible: np.ndarray
+    covariance: np.ndarray
 
     def __len__(self) -> int:
         return len(self.source)
@@ -49,10 +57,19 @@ class Answers:
 def answer_by_network(pose: Pose, radius_m: Tensor | None = None, radius_deg: Tensor | None = None) -> Answers:
     """(M,) poses of a network, with the radii of their errors where they are known."""
     count = len(pose.position_m)
-    unknown = np.full(count, np.nan)
-    radii = (unknown if radius is None else radius.numpy() for radius in (radius_m, radius_deg))
+    unknown, none = np.full(count, np.nan), np.full(count, -1)
     position_m, quat_wxyz = (part.detach().cpu().numpy() for part in pose)
-    return Answers(position_m, quat_wxyz, ("network",) * count, ("",) * count, *radii)
+    return Answers(
+        position_m,
+        quat_wxyz,
+        ("network",) * count,
+        ("",) * count,
+        unknown if radius_m is None else radius_m.numpy(),
+        unknown if radius_deg is None else radius_deg.numpy(),
+        none,
+        none,
+        np.full((count, 6, 6), np.nan),
+    )
 
 
 def answer_by_map(
@@ -80,7 +97,31 @@ def answer_by_map(
     source: tuple[Source, ...] = tuple("map" if ok else instead for ok, instead in zip(accepted, other, strict=True))
     reason = tuple(answer.reason for answer in found)
     position_m, quat_wxyz = (part.detach().cpu().numpy() for part in pose)
-    return Answers(position_m, quat_wxyz, source, reason, radius_m, radius_deg)
+    inliers, visible = (np.array([getattr(answer, name) for answer in found]) for name in ("inliers", "visible"))
+    covariance = np.array([_turn_covariance(answer, scale, network) for answer in found]).reshape(-1, 6, 6)
+    return Answers(position_m, quat_wxyz, source, reason, radius_m, radius_deg, inliers, visible, covariance)
+
+
+SPHERE = 1.4435
+"""Radius that holds 90 % of a three-dimensional normal distribution, by the root of the sum of its variances, where
+these are equal."""
+
+
+def _turn_covariance(answer: MapAnswer, scale: float, network: MapNetwork) -> np.ndarray:
+    """(6, 6) of position and rotation in the world's axes and unit; nan where the map has no pose.
+
+    Args:
+        answer: whose covariance is of a rotation in the camera's axes and a movement in the map's unit.
+        scale: of the map's positions in the scene's unit.
+        network: the map, with the factors of its radii.
+    """
+    if answer.covariance is None:
+        return np.full((6, 6), np.nan)
+    factors = [factor / SPHERE if np.isfinite(factor) else 1.0 for factor in network.calibration.tolist()]
+    change = np.zeros((6, 6))
+    change[:3, 3:] = np.eye(3) * factors[0] * scale
+    change[3:, :3] = answer.pose_in_map.rotation * factors[1]
+    return change @ answer.covariance @ change.T
 
 
 def replace_accepted(pose: Pose, answers: Sequence[MapAnswer], world_frame: WorldFrame) -> Pose:
