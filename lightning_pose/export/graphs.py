@@ -12,9 +12,10 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from lightning_pose.errors import ConfigError
+from lightning_pose.export.recurrent import LSTMOverTime
 from lightning_pose.features import CNN, FeatureExtractor
 from lightning_pose.geometry.quaternions import quat_normalize
-from lightning_pose.models import GraphPose, NodePose, PoseModule, SurfCNN
+from lightning_pose.models import CNNRNN, GraphPose, NodePose, PoseModule, SurfCNN
 from lightning_pose.models.clip import ClipModule
 from lightning_pose.models.parts.error_radius import CELLS, ErrorRadius
 from lightning_pose.models.parts.graph_conv import GraphConvolution
@@ -82,6 +83,7 @@ class ClipGraph(nn.Module):
     def __init__(self, model: ClipModule) -> None:
         super().__init__()
         self.model = model
+        self.lstm = LSTMOverTime(model.network.lstm) if isinstance(model, CNNRNN) else None
         self.scale = model.world_frame.scale
 
     def forward(self, clip: Tensor) -> tuple[Tensor, Tensor]:
@@ -91,7 +93,12 @@ class ClipGraph(nn.Module):
         else:
             read = model.standardize_input(clip)
         images = read.reshape(1, -1, *model.image_shape)
-        position, quat_raw = model.unscale_pose(model.network(images))
+        if self.lstm is not None and isinstance(model, CNNRNN):
+            frames = model.network.convolutions(images[0]).flatten(1)
+            poses = model.network.head(self.lstm(frames))[None]
+        else:
+            poses = model.network(images)
+        position, quat_raw = model.unscale_pose(poses)
         return position[0].double() * self.scale, quat_normalize(quat_raw[0])
 
 
@@ -176,7 +183,7 @@ class _NodeDecoder(nn.Module):
 
     def __init__(self, model: NodePose) -> None:
         super().__init__()
-        memory = model._compute_memory()
+        memory = model.compute_memory()
         self.model = model
         self.k = min(model.neighbours, len(memory.keys))
         self.register_buffer("keys", memory.keys.clone())

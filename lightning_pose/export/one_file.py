@@ -8,6 +8,7 @@ package that the file may not import. A module of the package may be replaced by
 from __future__ import annotations
 
 import ast
+import copy
 import re
 import sys
 from collections.abc import Iterable, Mapping
@@ -80,8 +81,7 @@ class _Collector:
 
     def need(self, module: str, name: str) -> None:
         """Take a definition, and whatever it uses, unless it is taken already."""
-        found = self.modules.setdefault(module, None) or _read_module(module)  # type: ignore[arg-type]
-        self.modules[module] = found
+        found = self.modules.get(module) or self.modules.setdefault(module, _read_module(module))
         number = found.find(name)
         if number is None:
             if name not in found.imported:
@@ -92,16 +92,32 @@ class _Collector:
             return
         found.needed.add(number)
         statement = found.statements[number]
-        for used in sorted(statement.used | statement.annotated):
-            if found.find(used) is not None:
-                self.need(module, used)
-            elif used in found.imported:
-                self._need_imported(found, used, optional=used not in statement.used)
+        for used in sorted(statement.used):
+            self._need_used(found, used)
+        for used in sorted(statement.annotated - statement.used):
+            if self._can_have(found, used):
+                self._need_used(found, used)
         if module not in self.order:
             self.order.append(module)
 
-    def _need_imported(self, module: Module, name: str, optional: bool = False) -> None:
-        """Take what a module imports under a name; where it is `optional`, only if that is possible."""
+    def _need_used(self, module: Module, name: str) -> None:
+        """Take what a name means in a module; names of Python itself and of arguments mean nothing there."""
+        if module.find(name) is not None:
+            self.need(module.name, name)
+        elif name in module.imported:
+            self._need_imported(module, name)
+
+    def _can_have(self, module: Module, name: str) -> bool:
+        """Whether a name of an annotation can be taken."""
+        trial = copy.deepcopy(self)
+        try:
+            trial._need_used(trial.modules[module.name], name)
+        except ValueError:
+            return False
+        return True
+
+    def _need_imported(self, module: Module, name: str) -> None:
+        """Take what a module imports under a name."""
         source, original = module.imported[name]
         dotted = source if original is None else f"{source}.{original}"
         if dotted in self.replaced:
@@ -111,7 +127,7 @@ class _Collector:
         elif source.partition(".")[0] in {*sys.stdlib_module_names, *ALLOWED}:
             if self.imports.setdefault(name, (source, original)) != (source, original):
                 raise ValueError(f"{name} is imported from {source} and from {self.imports[name][0]}")
-        elif not optional:
+        else:
             raise ValueError(f"{module.name} needs {dotted}, which an exported folder does not have")
 
     def write(self, head: str, tail: str) -> str:

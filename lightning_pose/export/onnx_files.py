@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from lightning_pose.errors import ConfigError
 from lightning_pose.export.graphs import OUTPUTS, ClipGraph, make_graph
+from lightning_pose.export.recurrent import list_translations
 from lightning_pose.features import CNN, FeatureExtractor
 from lightning_pose.models import PoseModule
 
@@ -133,6 +134,7 @@ def _trace(
                 opset_version=OPSET,
                 dynamo=True,
                 dynamic_shapes=dynamic,
+                custom_translation_table=list_translations(),
                 verbose=False,
             )
     except Exception as error:  # torch, its tracer and onnxscript raise many kinds

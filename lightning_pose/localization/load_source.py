@@ -30,5 +30,7 @@ def load_system(source: str | Path, allow: Sequence[str], tracking_uri: str | No
 
 
 def _load_exported(folder: Path) -> LocatingSystem:
-    """The system of a folder that `export` wrote, without torch."""
-    raise ConfigError(f"{folder} is a folder, which cannot be loaded yet; give a checkpoint that `fit` wrote")
+    """The system of a folder that `export` wrote, without torch; code in the folder is not run."""
+    from lightning_pose.export.runner.system import ExportedSystem
+
+    return ExportedSystem(folder)

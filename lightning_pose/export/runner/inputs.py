@@ -10,13 +10,21 @@ import cv2
 import numpy as np
 
 from lightning_pose.errors import ConfigError, ImageError
-from lightning_pose.localization.inputs import REMEDY, Color, LoadedImage, is_image_array, is_video
-from lightning_pose.scenes.images import convert_pixels, decode_pixels, read_bytes, to_gray
+from lightning_pose.localization.inputs import Color, LoadedImage, is_video
+from lightning_pose.scenes.images import decode_image, read_bytes, to_gray
 
-__all__ = ["list_images", "load_image"]
+__all__ = ["ImageInput", "list_images", "load_image"]
 
-EXIF_IFD, FOCAL_35MM = 0x8769, 0xA405
-"""Tags of EXIF: where the camera's own tags are, and the focal length on film of 36 x 24 mm."""
+ImageInput = object
+"""One image: a file, a uint8 array (H, W) gray or (H, W, 3) RGB, or a PIL image."""
+
+ACCEPTED = "give an image file, a uint8 array (H, W) or (H, W, 3) RGB, a PIL image, or a list of these"
+
+ORIENTATION, EXIF_IFD, FOCAL_35MM = 0x0112, 0x8769, 0xA405
+"""Tags of EXIF: orientation, where the camera's own tags are, and the focal length on film of 36 x 24 mm."""
+
+EXIF_MARKS = (b"Exif\0\0", b"eXIf")
+"""What stands before an EXIF block in a JPEG, and in a PNG."""
 
 
 def list_images(images: object) -> Sequence[object] | None:
@@ -25,10 +33,10 @@ def list_images(images: object) -> Sequence[object] | None:
     Raises:
         ConfigError: it is neither.
     """
-    if isinstance(images, str | Path) or is_image_array(images) or hasattr(images, "convert"):
+    if isinstance(images, str | Path) or is_pixels(images) or hasattr(images, "convert"):
         return None
     if isinstance(images, bytes | dict) or not isinstance(images, Iterable):
-        raise ConfigError(f"images is {str(images)[:40]!r} ({type(images).__name__}); {REMEDY}")
+        raise ConfigError(f"images is {str(images)[:40]!r} ({type(images).__name__}); {ACCEPTED}")
     return list(images)
 
 
@@ -42,33 +50,44 @@ def load_image(image: object, color: Color, number: int = 0) -> LoadedImage:
     if isinstance(image, str | Path):
         path = Path(image).expanduser()
         if path.is_dir():
-            raise ImageError(f"{image} is a folder; give its images, such as {image}/*.png")
+            raise ImageError(
+                f"{image} is a folder; give its images, such as sorted(Path({str(image)!r}).glob('*.png'))"
+            )
         if is_video(path) and path.is_file():
             raise ImageError(f"{image} is a video among images; give it alone")
-        pixels, exif = decode_pixels(read_bytes(path), path)
-        orientation, focal_35mm = parse_exif(exif)
-        return LoadedImage(convert_pixels(pixels, color == "rgb"), str(image), orientation, focal_35mm)
+        data = read_bytes(path)
+        return LoadedImage(decode_image(data, path, color == "rgb"), str(image), *parse_exif(data))
+    facts: tuple[int, float | None] = 1, None
     if hasattr(image, "convert"):
-        exif = image.getexif().tobytes() if hasattr(image, "getexif") else b""
-        return LoadedImage(convert_pixels(np.asarray(image.convert("RGB")), color == "rgb"), None, *parse_exif(exif))
-    if not isinstance(image, np.ndarray) or not is_image_array(image) or image.dtype != np.uint8 or not image.size:
-        raise ConfigError(f"image {number} is no uint8 array (H, W) or (H, W, 3); {REMEDY}")
+        facts = parse_exif(EXIF_MARKS[0] + image.getexif().tobytes().removeprefix(EXIF_MARKS[0]))
+        image = np.asarray(image.convert("RGB"))
+    if not isinstance(image, np.ndarray) or not is_pixels(image) or image.dtype != np.uint8 or not image.size:
+        what = f"of shape {image.shape} and type {image.dtype}" if isinstance(image, np.ndarray) else f"{image!r:.40}"
+        raise ConfigError(f"image {number} is {what}; {ACCEPTED}")
     if color == "gray":
-        return LoadedImage(to_gray(image))
-    return LoadedImage(image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2RGB))
+        return LoadedImage(to_gray(image), None, *facts)
+    return LoadedImage(image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2RGB), None, *facts)
 
 
-def parse_exif(exif: bytes) -> tuple[int, float | None]:
-    """Orientation, 1 to 8, and focal length on film of 36 x 24 mm, of an EXIF block; 1 and None if it has none."""
-    exif = exif.removeprefix(b"Exif\0\0")
+def is_pixels(value: object) -> bool:
+    """Whether it is an array of the shape of an image."""
+    return isinstance(value, np.ndarray) and (value.ndim == 2 or (value.ndim == 3 and value.shape[2] == 3))
+
+
+def parse_exif(data: bytes) -> tuple[int, float | None]:
+    """Orientation, 1 to 8, and focal length on film of 36 x 24 mm, in an image file; 1 and None if it has none."""
+    starts = [at + len(mark) for mark in EXIF_MARKS if (at := data.find(mark, 0, 1 << 18)) >= 0]
+    exif = data[starts[0] : starts[0] + (1 << 16)] if starts else b""
     order = {b"II*\0": "<", b"MM\0*": ">"}.get(exif[:4])
+    if order is None:
+        return 1, None
     try:
-        tags = {} if order is None else dict(list_tags(exif, order, struct.unpack_from(f"{order}I", exif, 4)[0]))
-        inner = dict(list_tags(exif, order or "<", tags[EXIF_IFD])) if EXIF_IFD in tags else {}
+        tags = dict(list_tags(exif, order, struct.unpack_from(f"{order}I", exif, 4)[0]))
+        inner = dict(list_tags(exif, order, tags[EXIF_IFD])) if EXIF_IFD in tags else {}
     except struct.error:  # a damaged block says nothing
         return 1, None
-    orientation, focal = tags.get(0x0112, 1), inner.get(FOCAL_35MM)
-    return orientation if orientation in range(1, 9) else 1, float(focal) if focal and 1 <= focal <= 2000 else None
+    orientation, focal = tags.get(ORIENTATION, 1), inner.get(FOCAL_35MM, 0)
+    return orientation if orientation in range(1, 9) else 1, float(focal) if 1 <= focal <= 2000 else None
 
 
 def list_tags(exif: bytes, order: str, start: int) -> Iterator[tuple[int, int]]:

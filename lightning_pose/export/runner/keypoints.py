@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -31,6 +31,14 @@ class KeypointSettings:
     with_geometry: bool = True
     upright: bool = True
     threshold: float = 0.0
+
+    def extracts_as(self, other: KeypointSettings) -> bool:
+        """Whether the keypoints of both are the same, or the first of the same."""
+        ours, theirs = (replace(each, n_features=0, with_geometry=False) for each in (self, other))
+        most = max(MIN_STORED_FEATURES, other.n_features)
+        return (
+            ours == theirs and max(MIN_STORED_FEATURES, self.n_features) == most and other.n_features <= self.n_features
+        )
 
 
 @dataclass(frozen=True)
@@ -81,9 +89,7 @@ def extract_with_opencv(gray: np.ndarray, n: int, settings: KeypointSettings) ->
     return rows[order], raw / np.maximum(norms, np.finfo(np.float32).tiny)
 
 
-def make_opencv_extractor(
-    n: int, settings: KeypointSettings
-) -> tuple[cv2.FastFeatureDetector | None, cv2.Feature2D]:
+def make_opencv_extractor(n: int, settings: KeypointSettings) -> tuple[cv2.FastFeatureDetector | None, cv2.Feature2D]:
     """A detector, None where the second finds its keypoints itself, and what describes keypoints."""
     if settings.name == "SIFT":
         return None, cv2.SIFT.create(n, contrastThreshold=settings.threshold)
@@ -103,11 +109,12 @@ def make_opencv_extractor(
 
 def make_rows(found: Keypoints, settings: KeypointSettings) -> np.ndarray:
     """(N, D) float32 for a network, or (N, D + 4) with place, size and response; rows of zeros at the end."""
+    geometry, descriptors = found.geometry[: settings.n_features], found.descriptors[: settings.n_features]
     rows = np.zeros((settings.n_features, settings.columns + 4 * settings.with_geometry), np.float32)
-    count = len(found.geometry)
-    rows[:count, : settings.columns] = found.descriptors
+    count = len(geometry)
+    rows[:count, : settings.columns] = descriptors
     if settings.with_geometry and count:
-        x, y, size, response = found.geometry[:, :4].T
+        x, y, size, response = geometry[:, :4].T
         half_w, half_h = np.maximum(np.array(found.size) / 2, 0.5)
         strongest = max(float(response[0]), np.finfo(np.float32).tiny)
         rows[:count, settings.columns] = x / half_w - 1
