@@ -83,7 +83,8 @@ def measure_angle_deg(a: LocatedPose, b: LocatedPose) -> float:
 def load_runner(folder: Path) -> Iterator[ModuleType]:
     """The folder's `localizer.py`, which has just been written; folders of others are never run."""
     spec = importlib.util.spec_from_file_location("lightning_pose_exported_localizer", folder / "localizer.py")
-    assert spec is not None and spec.loader is not None
+    assert spec is not None
+    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module  # dataclasses look their module up
     try:

@@ -68,7 +68,8 @@ def measure_errors(folder: Path, frames: CheckFrames) -> tuple[np.ndarray, list[
     Of a model of clips the truth is moved to the first frame, as its answers are.
     """
     poses = locate_images(Localizer(ExportedSystem(folder)), frames.images)
-    assert frames.position_m is not None and frames.quat_wxyz is not None
+    assert frames.position_m is not None
+    assert frames.quat_wxyz is not None
     position, quat = frames.position_m, frames.quat_wxyz / np.linalg.norm(frames.quat_wxyz, axis=1, keepdims=True)
     found, turned = np.array([pose.position_m for pose in poses]), np.array([pose.quat_wxyz for pose in poses])
     away = np.linalg.norm(found - position, axis=1)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 __all__ = ["OPSET", "quantize_file", "require_onnx", "write_onnx"]
 
 OPSET = 20
-"""Of ONNX's operators: the first with `Resize` as torch antialiases, and with int64 in `Where`; onnxruntime 1.17 reads it."""
+"""Version of ONNX's operators; onnxruntime reads it from 1.17 on."""
 
 EXTRA = "run `uv sync --extra export`, or `pip install onnx onnxscript onnxruntime`"
 
@@ -34,42 +34,68 @@ CLIP_FRAMES = 5
 """Frames of the clip that a graph is traced with; it takes any number from 2."""
 
 PREPARE = """
-<ir_version: 9, opset_import: ["" : {opset}]>
+<ir_version: {version}, opset_import: ["" : {opset}]>
 prepare (uint8[height, width, 3] image) => (float[1, 3, {side}, {side}] rgb)
-<int64[2] shape_axes = {{0, 1}}, int64[1] batch = {{0}}, float[1] full = {{255.0}}, int64[2] front = {{1, 3}},
- float[1] short = {{{short}.0}}, int64[2] square = {{{side}, {side}}}, int64[1] two = {{2}}, int64[2] axes = {{2, 3}}>
+<float full = {{255.0}}, float zero = {{0.0}}, float one = {{1.0}}, float half = {{0.5}}, int64[1] batch = {{0}},
+ int64[1] last = {{1}}, int64 two = {{2}}, int64 side = {{{side}}}, double short = {{{short}.0}}>
 {{
     channels_first = Transpose <perm = [2, 0, 1]> (image)
-    one = Unsqueeze (channels_first, batch)
-    as_float = Cast <to = 1> (one)
-    scaled = Div (as_float, full)
-    {steps}
+    as_float = Cast <to = 1> (channels_first)
+    pixels = Div (as_float, full)
+    sides = Shape <end = 2> (image)
+    shortest = ReduceMin <keepdims = 0> (sides)
+    {rows}
+    {columns}
+    narrow = MatMul (pixels, columns_across)
+    small = MatMul (rows_weights, narrow)
+    rgb = Unsqueeze (small, batch)
 }}
 """
+"""An image of any size to the square that a CNN reads."""
 
-RESIZE = 'Resize <mode = "linear", antialias = 1, coordinate_transformation_mode = "half_pixel">'
+AXIS = """
+    {axis}_number = Constant <value = int64 {{{number}}}> ()
+    {axis}_length = Gather (sides, {axis}_number)
+    {size}
+    {axis}_spare = Sub ({axis}_size, side)
+    {axis}_first = Div ({axis}_spare, two)
+    {axis}_end = Add ({axis}_first, side)
+    {axis}_step = Constant <value = int64 {{1}}> ()
+    {axis}_start = Constant <value = int64 {{0}}> ()
+    {axis}_length_f = Cast <to = 1> ({axis}_length)
+    {axis}_size_f = Cast <to = 1> ({axis}_size)
+    {axis}_scale = Div ({axis}_length_f, {axis}_size_f)
+    {axis}_wide = Max ({axis}_scale, one)
+    {axis}_to = Range ({axis}_first, {axis}_end, {axis}_step)
+    {axis}_to_f = Cast <to = 1> ({axis}_to)
+    {axis}_to_middle = Add ({axis}_to_f, half)
+    {axis}_centre = Mul ({axis}_to_middle, {axis}_scale)
+    {axis}_column = Unsqueeze ({axis}_centre, last)
+    {axis}_from = Range ({axis}_start, {axis}_length, {axis}_step)
+    {axis}_from_f = Cast <to = 1> ({axis}_from)
+    {axis}_from_middle = Add ({axis}_from_f, half)
+    {axis}_apart = Sub ({axis}_from_middle, {axis}_column)
+    {axis}_away = Abs ({axis}_apart)
+    {axis}_share = Div ({axis}_away, {axis}_wide)
+    {axis}_height = Sub (one, {axis}_share)
+    {axis}_raw = Max ({axis}_height, zero)
+    {axis}_sum = ReduceSum <keepdims = 1> ({axis}_raw, last)
+    {axis}_weights = Div ({axis}_raw, {axis}_sum)
+    {axis}_across = Transpose <perm = [1, 0]> ({axis}_weights)
+"""
+"""Weights (side, length) of bilinear interpolation with antialiasing along one axis: a triangle around each centre.
 
-WHOLE = f"""
-    whole = Constant <value = int64[4] {{{{1, 3, {{side}}, {{side}}}}}}> ()
-    rgb = {RESIZE} (scaled, , , whole)
+ONNX has `Resize` with antialiasing, but onnxruntime 1.32 computes it wrongly where the two axes shrink differently.
 """
 
-CENTER = f"""
-    shape = Shape <start = 0, end = 2> (image)
-    sides = Cast <to = 11> (shape)
-    shortest = ReduceMin <keepdims = 1> (sides)
-    wanted = Constant <value = double[1] {{{{{{short}}.0}}}}> ()
-    factor = Div (wanted, shortest)
-    exact = Mul (sides, factor)
-    rounded = Round (exact)
-    size = Cast <to = 7> (rounded)
-    target = Concat <axis = 0> (front, size)
-    resized = {RESIZE} (scaled, , , target)
-    spare = Sub (size, square)
-    first = Div (spare, two)
-    last = Add (first, square)
-    rgb = Slice (resized, first, last, axes)
-"""
+WHOLE = "{axis}_size = Identity (side)"
+CENTER = """{axis}_exact = Cast <to = 11> ({axis}_length)
+    {axis}_shortest = Cast <to = 11> (shortest)
+    {axis}_factor = Div (short, {axis}_shortest)
+    {axis}_product = Mul ({axis}_exact, {axis}_factor)
+    {axis}_rounded = Round ({axis}_product)
+    {axis}_size = Cast <to = 7> ({axis}_rounded)"""
+"""Length of an axis once the whole image is resized: to the square itself, or until its shorter side is `short`."""
 
 
 def require_onnx() -> None:
@@ -106,7 +132,7 @@ def write_onnx(model: PoseModule, extractor: FeatureExtractor, path: Path) -> No
     dynamic = ({1: torch.export.Dim("frames", min=2, max=10_000)},) if isinstance(graph, ClipGraph) else None
     proto = _trace(graph, example, list(OUTPUTS[:2] if isinstance(graph, ClipGraph) else OUTPUTS), dynamic, model)
     if isinstance(extractor, CNN):
-        proto = onnx.compose.merge_models(_make_preparation(extractor), proto, [("rgb", "features")])
+        proto = onnx.compose.merge_models(_make_preparation(extractor, proto.ir_version), proto, [("rgb", "features")])
     proto.producer_name, proto.doc_string = "lightning_pose", ""
     onnx.save(proto, path)
 
@@ -160,12 +186,18 @@ def _silence() -> Iterator[None]:
             logger.setLevel(level)
 
 
-def _make_preparation(extractor: CNN) -> ModelProto:
+def _make_preparation(extractor: CNN, version: int) -> ModelProto:
     """What `CNN.extract` does to an image of any size before its network sees it."""
     import onnx
 
-    steps = (WHOLE if extractor.crop == "whole" else CENTER).format(side=extractor.side, short=extractor.short_side)
-    text = PREPARE.format(opset=OPSET, side=extractor.side, short=extractor.short_side, steps=steps)
+    size = WHOLE if extractor.crop == "whole" else CENTER
+    rows, columns = (
+        AXIS.format(axis=axis, number=number, size=size.format(axis=axis))
+        for number, axis in enumerate(("rows", "columns"))
+    )
+    text = PREPARE.format(
+        version=version, opset=OPSET, side=extractor.side, short=extractor.short_side, rows=rows, columns=columns
+    )
     return onnx.parser.parse_model(text)
 
 

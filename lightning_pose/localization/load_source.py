@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lightning_pose.errors import ConfigError
-
 if TYPE_CHECKING:
     from lightning_pose.localization.localizer import LocatingSystem
 

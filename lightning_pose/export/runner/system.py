@@ -176,7 +176,8 @@ class ExportedSystem:
         """Locate the frames of one video, in order; the world is the first camera."""
         if not images:
             return []
-        assert self.network is not None and self.clips is not None
+        assert self.network is not None
+        assert self.clips is not None
         network, started = self.network, time.perf_counter()
         frames = np.concatenate([self.prepare_features(image.array, None) for image in images])
         extracted = time.perf_counter()
