@@ -49,14 +49,14 @@ class Agreement:
         """
         if self.other_status:
             raise ConfigError(
-                f"the exported model accepts other images than the checkpoint: {len(self.other_status)} of {self.images}, "
-                f"the first is {self.other_status[0]}; nothing was written"
+                f"the exported model accepts other images than the checkpoint: {len(self.other_status)} of "
+                f"{self.images}, the first is {self.other_status[0]}; nothing was written"
             )
         if not (self.position_m <= MOST_M * scale and self.orientation_deg <= MOST_DEG):
             raise ConfigError(
-                f"the exported model's answers are up to {self.position_m:.2g} m and {self.orientation_deg:.2g} deg from "
-                f"the checkpoint's, of {self.images} images; at most {MOST_M:g} m and {MOST_DEG:g} deg are allowed, and "
-                "nothing was written"
+                f"the exported model's answers to {self.images} images are up to {self.position_m:.2g} m and "
+                f"{self.orientation_deg:.2g} deg from the checkpoint's; at most {MOST_M:g} m and {MOST_DEG:g} deg are "
+                "allowed, and nothing was written"
             )
 
 

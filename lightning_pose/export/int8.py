@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -43,7 +42,7 @@ def shrink_network(folder: Path, network: str, frames: CheckFrames) -> Mapping[s
     before, accepted = measure_errors(folder, frames)
     whole, small = folder / network, folder / f"{network}.int8"
     quantize_file(whole, small)
-    os.replace(small, whole)
+    small.replace(whole)
     after, accepted_after = measure_errors(folder, frames)
     facts = {
         "frames": len(frames.images),

@@ -167,7 +167,8 @@ def _write_headline(module: Module) -> str:
 def _read_module(name: str) -> Module:
     """Part a module of the package into its statements."""
     spec = find_spec(name)
-    assert spec is not None and spec.origin is not None, name
+    assert spec is not None, name
+    assert spec.origin is not None, name
     source = Path(spec.origin).read_text(encoding="utf-8")
     lines, tree = source.splitlines(), ast.parse(source)
     module = Module(name, (ast.get_docstring(tree) or name).splitlines()[0], [], {})
@@ -203,7 +204,7 @@ def _find_start(node: ast.stmt, lines: list[str], end: int) -> int:
 def _list_imports(node: ast.Import | ast.ImportFrom) -> dict[str, tuple[str, str | None]]:
     if isinstance(node, ast.Import):
         return {alias.asname or alias.name: (alias.name, None) for alias in node.names}
-    assert node.module is not None and not node.level, "imports are absolute"
+    assert node.module is not None, "imports are absolute"
     return {alias.asname or alias.name: (node.module, alias.name) for alias in node.names}
 
 

@@ -1,1 +1,1 @@
-"""What asks an exported folder, with numpy, OpenCV and onnxruntime alone; `one_file` makes the folder's runner of it."""
+"""What asks an exported folder, with numpy, OpenCV and onnxruntime alone; `one_file` writes it into the folder."""

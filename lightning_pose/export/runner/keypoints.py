@@ -23,7 +23,7 @@ SMALLEST_SIDE = 8
 
 @dataclass(frozen=True)
 class KeypointSettings:
-    """An extractor: `SURF`, `SIFT`, `ORB`, `AKAZE`, `FREAK` or `BRIEF`, how many keypoints it keeps, and its options."""
+    """An extractor: `SURF`, `SIFT`, `ORB`, `AKAZE`, `FREAK` or `BRIEF`, keypoints to keep, and options."""
 
     name: str
     n_features: int
@@ -68,7 +68,7 @@ def extract_keypoints(gray: np.ndarray, settings: KeypointSettings) -> Keypoints
 
 
 def extract_with_opencv(gray: np.ndarray, n: int, settings: KeypointSettings) -> tuple[np.ndarray, np.ndarray]:
-    """As `extract_surf`, by OpenCV's extractor of this name; binary descriptors get a column of -1 or +1 for each bit."""
+    """As `extract_surf`, by OpenCV's extractor of this name; binary descriptors get a column of -1 or +1 a bit."""
     detector, describer = make_opencv_extractor(n, settings)
     found, raw = ((), None)
     if min(gray.shape) >= SMALLEST_SIDE:

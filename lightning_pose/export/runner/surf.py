@@ -36,7 +36,7 @@ class Detections(NamedTuple):
 
 
 class Candidates(NamedTuple):
-    """Samples that no neighbour in layers 1 to 3 exceeds: place in the planes, octave, layer, row, column; (K,) each."""
+    """Samples that no neighbour in layers 1 to 3 exceeds: place in planes, octave, layer, row, column; (K,) each."""
 
     at: np.ndarray
     octave: np.ndarray
@@ -184,7 +184,7 @@ def make_boxes() -> tuple[np.ndarray, np.ndarray]:
     """The filters of all layers (octave * LAYERS + layer) as eight boxes each: two of dxx, two of dyy, four of dxy.
 
     Returns:
-        (2, 32, 20): y and x of the boxes' corners, corner by corner; (2, 20): areas that normalise dxx and dyy, and dxy.
+        (2, 32, 20): y and x of the boxes' corners, corner by corner; (2, 20): areas of dxx and dyy, and of dxy.
     """
     boxes, areas = [], []
     for octave, layer in product(range(OCTAVES), range(LAYERS)):

@@ -63,8 +63,8 @@ def read_facts(folder: Path) -> dict[str, Any]:
         raise CheckpointError(f"{path} is no localizer that `export` wrote; give another folder")
     if version > FORMAT_VERSION:
         raise CheckpointError(
-            f"{folder} has format {version}, and this version reads up to {FORMAT_VERSION}; use the localizer.py in the "
-            "folder, or install a newer version"
+            f"{folder} has format {version}, and this version reads up to {FORMAT_VERSION}; use the localizer.py in "
+            "the folder, or install a newer version"
         )
     if version < OLDEST_VERSION:
         raise CheckpointError(f"{folder} has format {version}, which is not read any more; export the model again")
@@ -144,7 +144,7 @@ class ExportedSystem:
         return np.ascontiguousarray(array)
 
     def combine(self, alone: NetworkAnswer | None, answer: MapAnswer | None) -> dict[str, Any]:
-        """The fields of a `LocatedPose`: the map's pose where it accepts, else the network's, or the nearest frame's."""
+        """The fields of a `LocatedPose`: the map's pose where it accepts, else the network's, or a frame's."""
         fields: dict[str, Any] = {}
         if alone is not None:
             fields = {
