@@ -18,6 +18,10 @@ VERBS = {
     "validate": ("lightning_pose.cli", "measure a checkpoint on the validation frames"),
     "test": ("lightning_pose.cli", "measure a checkpoint on the test frames, beside its baselines"),
     "predict": ("lightning_pose.cli", "write a checkpoint's poses of the test frames as TUM files"),
+    "localize": (
+        "lightning_pose.commands.localize",
+        "locate images, a folder, a video or a camera with a trained system",
+    ),
     "extract": ("lightning_pose.commands.extract", "fill the feature cache: parallel, resumable"),
     "sweep": ("lightning_pose.commands.sweep", "search a config's settings, on validation frames: parallel, resumable"),
     "report": (

@@ -29,11 +29,13 @@ def main(argv: list[str]) -> int:
     from lightning_pose.checkpoint import read_checkpoint
     from lightning_pose.export.folder import check_target, export_system  # torch, which takes seconds to import
     from lightning_pose.export.frames import find_run_frames, list_image_files
+    from lightning_pose.localization.load_source import find_checkpoint
     from lightning_pose.localization.trained_system import TrainedSystem
 
     check_target(args.out, args.overwrite)
     allow = args.allow or []
-    system, checkpoint = TrainedSystem.from_checkpoint(args.model, allow), read_checkpoint(args.model)
+    file = find_checkpoint(args.model, args.tracking_uri)
+    system, checkpoint = TrainedSystem.from_checkpoint(file, allow), read_checkpoint(file)
     if args.images:
         frames = list_image_files(args.images)
     else:
@@ -47,7 +49,7 @@ def main(argv: list[str]) -> int:
 
 def _build_parser() -> VerbParser:
     parser = VerbParser("export", description=DESCRIPTION, epilog=EPILOG)
-    parser.add_argument("model", metavar="MODEL", type=Path, help="a checkpoint that fit wrote")
+    parser.add_argument("model", metavar="MODEL", help="a checkpoint that fit wrote, a run id, or a model's address")
     parser.add_argument("--out", metavar="FOLDER", type=Path, required=True, help="folder to write")
     parser.add_argument("--overwrite", action="store_true", help="replace a folder that export wrote")
     parser.add_argument(
@@ -59,5 +61,6 @@ def _build_parser() -> VerbParser:
         action="store_true",
         help="weights in 8 bits, if that costs at most 5 %% of the accuracy on frames of the run",
     )
+    parser.add_argument("--tracking_uri", help="MLflow's store, for runs and models")
     parser.add_argument("--allow", action="append", help="class path, or package, of your own that it may name")
     return parser

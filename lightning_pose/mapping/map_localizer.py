@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +25,15 @@ SIGMA_PX = 1.0
 INLIER_PX = 3.0
 ACCEPT_INLIERS = 20
 """Guided matches within 3 px that an accepted pose needs. With 12, poses came through that were metres off."""
+
+ACCEPT_NEAR_PRIOR = 12
+"""The same where the pose agrees with a prior."""
+
+PRIOR = (0.5, 30.0)
+"""How far a pose may lie from a prior: in median depths of the map's points, and degrees."""
+
+PRIOR_PX = 64.0
+"""How far a keypoint may lie from where a prior puts its point."""
 
 KERNEL = (0.05, 5.0)
 """How far training frames lend their offset to an answer: in median depths of the map's points, and degrees."""
@@ -101,13 +110,71 @@ class MapLocalizer:
         self._adjusted = bool(np.abs(self._turn_back).max() > 1e-12 or np.abs(self._move_back).max() > 1e-12)
         frame, point = point_map.seen_frame, point_map.seen_point
         distance = np.linalg.norm(point_map.points[point] - point_map.position[frame], axis=1)
-        self._kernel = KERNEL[0] * (float(np.median(distance)) if len(distance) else 1.0)
+        self._depth = float(np.median(distance)) if len(distance) else 1.0
+        self._kernel = KERNEL[0] * self._depth
 
-    def locate(self, query: MapQuery) -> MapAnswer:
-        """Where the image was taken: candidates, matches, RANSAC, one guided pass, refinement."""
+    def locate(self, query: MapQuery, prior: CameraPose | None = None) -> MapAnswer:
+        """Where the image was taken: candidates, matches, RANSAC, one guided pass, refinement.
+
+        Args:
+            query: the image.
+            prior: where it may have been taken, in the poses that the dataset gives. Points that it should show there
+                are tried first; then the whole map. A pose that agrees with it needs fewer inliers, a pose that does
+                not is refused.
+        """
         points = self._camera.remove(query.points)
         similarity = self._matcher.compare(query.descriptors)
-        frame, rows, matched = self._matcher.match_candidates(similarity)
+        if prior is None:
+            return self._search(query, points, similarity)
+        near = self.carry_forward(prior)
+        tracked = self._track(query, points, similarity, near)
+        if tracked is not None and tracked.inliers >= ACCEPT_INLIERS:
+            return tracked
+        found = self._search(query, points, similarity)
+        if found.accepted:
+            away, turned = self._measure_distance(found.pose_in_map, near)
+            if away <= PRIOR[0] and turned <= PRIOR[1]:
+                return found
+            reason = f"contradicts the prior: {away:.1f} times the scene's median depth and {turned:.0f} degrees away"
+            found = replace(found, reason=reason)
+        return found if tracked is None else tracked
+
+    def _track(self, query: MapQuery, points: np.ndarray, similarity: np.ndarray, near: CameraPose) -> MapAnswer | None:
+        """The accepted pose among the points that a pose of the map should show; None if there is none near it."""
+        matches = self._matcher.match_guided(query, points, similarity, near, PRIOR_PX)
+        found = self._solve(query, points, similarity, (-1, *matches[:2]), ACCEPT_NEAR_PRIOR)
+        if not found.accepted:
+            return None
+        away, turned = self._measure_distance(found.pose_in_map, near)
+        return found if away <= PRIOR[0] and turned <= PRIOR[1] else None
+
+    def _measure_distance(self, a: CameraPose, b: CameraPose) -> tuple[float, float]:
+        """Distance of two poses in median depths, and their angle in degrees."""
+        away = float(np.linalg.norm(a.position - b.position)) / self._depth
+        return away, float(np.degrees(np.linalg.norm(Rotation.from_matrix(a.rotation.T @ b.rotation).as_rotvec())))
+
+    def _search(self, query: MapQuery, points: np.ndarray, similarity: np.ndarray) -> MapAnswer:
+        """The pose among the points of the most similar training frames."""
+        return self._solve(query, points, similarity, self._matcher.match_candidates(similarity), ACCEPT_INLIERS)
+
+    def _solve(
+        self,
+        query: MapQuery,
+        points: np.ndarray,
+        similarity: np.ndarray,
+        matches: tuple[int, np.ndarray, np.ndarray],
+        accept: int,
+    ) -> MapAnswer:
+        """The pose on which most matches agree, after one guided pass and refinement.
+
+        Args:
+            query: the image.
+            points: (N, 2), its keypoints with the camera's error removed.
+            similarity: (N, P), from `compare`.
+            matches: the frame whose pose holds where none is found, keypoints (K,) and points (K,).
+            accept: how many inliers an accepted pose needs.
+        """
+        frame, rows, matched = matches
         if len(rows) < MIN_MATCHES:
             few = f"too few features: {len(points)}" if len(points) < MIN_MATCHES else f"too few matches: {len(rows)}"
             return self._refuse(frame, few)
@@ -126,7 +193,7 @@ class MapLocalizer:
         projected = local[:, :2] / np.maximum(local[:, 2:], 1e-9)
         inlier = np.linalg.norm(projected - points[rows], axis=1) * query.focal_px <= INLIER_PX
         inliers = int(inlier.sum())
-        reason = "" if inliers >= ACCEPT_INLIERS else f"too few guided inliers: {inliers} of {visible} points in view"
+        reason = "" if inliers >= accept else f"too few guided inliers: {inliers} of {visible} points in view"
         return self._answer(refined, inliers, visible, reason, ShownPoints(seen, projected, points[rows], inlier))
 
     def _answer(self, refined: RefinedPose, inliers: int, visible: int, reason: str, shown: ShownPoints) -> MapAnswer:

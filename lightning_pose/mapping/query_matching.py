@@ -23,7 +23,7 @@ MATCH_DISTANCE = 0.6
 MATCH_RATIO = 0.85
 
 GUIDED_PX = 8.0
-"""How far a keypoint may lie from where the pose puts the point."""
+"""How far a keypoint may lie from where a good pose puts the point."""
 
 GUIDED_DISTANCE = 0.7
 GUIDED_RATIO = 0.9
@@ -94,7 +94,12 @@ class QueryMatcher:
         return int(best[0]), rows[kept], points[best_point[kept]]
 
     def match_guided(
-        self, query: MapQuery, points: np.ndarray, similarity: np.ndarray, pose: CameraPose
+        self,
+        query: MapQuery,
+        points: np.ndarray,
+        similarity: np.ndarray,
+        pose: CameraPose,
+        radius_px: float = GUIDED_PX,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Mutual matches near where a pose puts the points that it should show.
 
@@ -103,6 +108,7 @@ class QueryMatcher:
             points: (N, 2), its keypoints with the camera's error removed.
             similarity: (N, P), from `compare`.
             pose: where the camera is thought to be.
+            radius_px: how far a keypoint may lie from its point.
 
         Returns:
             keypoints (K,), points (K,), and where the points that should be in view appear, (V, 2) normalised image
@@ -117,7 +123,7 @@ class QueryMatcher:
         visible = np.flatnonzero(inside & (-(away * self.map.direction).sum(axis=1) >= MIN_COSINE * distance))
         seen = seen[visible]
         squared = (points[:, None, 0] - seen[None, :, 0]) ** 2 + (points[:, None, 1] - seen[None, :, 1]) ** 2
-        row, column = np.nonzero(squared <= (GUIDED_PX / query.focal_px) ** 2)
+        row, column = np.nonzero(squared <= (radius_px / query.focal_px) ** 2)
         point = visible[column]
         octaves = np.log2(query.size_px[row] / query.focal_px) - (self.map.log_size[point] - np.log2(distance[point]))
         value = similarity[row, point]

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from mlflow import MlflowClient
 from PIL import Image
 
 from lightning_pose.checkpoint import read_checkpoint
@@ -117,3 +118,30 @@ def test_one_image_may_stand_alone(localizer: Localizer, images: list[Path]) -> 
 
 def test_no_image_has_no_pose(localizer: Localizer) -> None:
     assert localizer.localize([]) == []
+
+
+def test_runs_and_registered_models(trained: Trained, images: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run by its id, its logged model, and a registered one by its alias give the checkpoint's poses."""
+    workplace, run_id = trained.workplace, trained.run.info.run_id
+    registered = f"wall-{run_id[:8]}"
+    client = MlflowClient(workplace.uri, workplace.uri)
+    client.create_registered_model(registered)
+    client.create_model_version(registered, f"runs:/{run_id}/model", run_id)
+    client.set_registered_model_alias(registered, "champion", "1")
+    expected = Localizer.load(trained.best, allow="tests").localize(images[0])
+    for source in (run_id, f"runs:/{run_id}/model", f"models:/{registered}@champion", f"models:/{registered}/1"):
+        found = Localizer.load(source, allow="tests", tracking_uri=workplace.uri).localize(images[0])
+        np.testing.assert_array_equal(found.position_m, expected.position_m)
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", workplace.uri)
+    assert Localizer.load(run_id, allow="tests").system.name == "SurfLSTM"
+    with pytest.raises(ConfigError, match=rf"has no model models:/{registered}@loser .*; check the name"):
+        Localizer.load(f"models:/{registered}@loser")
+    with pytest.raises(ConfigError, match=r"has no model runs:/0{32}/model"):
+        Localizer.load("0" * 32)
+
+
+def test_what_cannot_be_loaded(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match=r"nothing.ckpt does not exist; give a checkpoint such as"):
+        Localizer.load("nothing.ckpt")
+    with pytest.raises(ConfigError, match=r"is a folder without localizer.json"):
+        Localizer.load(tmp_path)

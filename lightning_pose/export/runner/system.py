@@ -5,14 +5,14 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from lightning_pose.errors import CheckpointError
-from lightning_pose.export.runner.clips import chain_clips
+from lightning_pose.export.runner.clips import FrameFollower, chain_clips
 from lightning_pose.export.runner.keypoints import (
     Keypoints,
     KeypointSettings,
@@ -123,13 +123,20 @@ class ExportedSystem:
             features = self.prepare_features(image.array, shared)
         extracted = time.perf_counter()
         alone = self.network.locate(features) if self.network is not None and features is not None else None
-        answer = None
+        answer, fields = None, {}
         if self.map is not None and found is not None:
-            answer = self.map.locate(found, camera)
-        pose = self.combine(alone, answer)
+            if prior is not None:
+                prior = CameraPose(prior.rotation, (prior.position - self.origin) / self.scale)
+            answer = self.map.locate(found, camera, prior)
+            fields["inliers_px"] = self.map.find_inliers(answer, found, camera, image.size)
+        fields |= self.combine(alone, answer)
         ended = time.perf_counter()
-        pose["milliseconds"] = {"features": 1e3 * (extracted - started), "locate": 1e3 * (ended - extracted)}
-        return LocatedPose(**pose, image=image.name)
+        fields["milliseconds"] = {"features": 1e3 * (extracted - started), "locate": 1e3 * (ended - extracted)}
+        return LocatedPose(**fields, image=image.name)
+
+    def read_map_points(self) -> np.ndarray | None:
+        """(P, 3) points of the map in the world, in the scene's unit; None without a map."""
+        return None if self.map is None else self.map.localizer.map.points * self.scale + self.origin
 
     def prepare_features(self, array: np.ndarray, shared: Keypoints | None) -> np.ndarray:
         """What the network takes of an image; `shared` are keypoints of the same image for the map."""
@@ -195,6 +202,29 @@ class ExportedSystem:
             for image, position, quat in zip(images, position_m, quat_wxyz, strict=True)
         ]
 
+    def start_clip(self) -> Callable[[LoadedImage], LocatedPose]:
+        """A function that places the frames of one video as they come, for a model of clips."""
+        assert self.network is not None
+        assert self.clips is not None
+        network, in_camera = self.network, self.clips["relative_frame"] == "camera"
+        follower = FrameFollower(
+            self.clips["length"],
+            in_camera,
+            self.clips["integrate"],
+            lambda frames: network.locate_clip(np.concatenate(frames)[None]),
+        )
+
+        def locate_next(image: LoadedImage) -> LocatedPose:
+            started = time.perf_counter()
+            frame = self.prepare_features(image.array, None)
+            extracted = time.perf_counter()
+            position_m, quat_wxyz = follower.add(frame)
+            ended = time.perf_counter()
+            milliseconds = {"features": 1e3 * (extracted - started), "locate": 1e3 * (ended - extracted)}
+            return LocatedPose(position_m, quat_wxyz, milliseconds=milliseconds, image=image.name)
+
+        return locate_next
+
 
 class ExportedMap:
     """The landmark map of a folder.
@@ -213,11 +243,20 @@ class ExportedMap:
         self.scale = scale
         self.localizer = MapLocalizer(PointMap(**read_tensors(folder / facts["file"])))
 
-    def locate(self, found: Keypoints, camera: Camera | None) -> MapAnswer:
-        """Where an image with these keypoints was taken."""
-        return self.localizer.locate(
-            make_query(found, scale_camera(camera or self.view, *found.size, setting="camera"))
-        )
+    def locate(self, found: Keypoints, camera: Camera | None, prior: CameraPose | None) -> MapAnswer:
+        """Where an image with these keypoints was taken; the prior is in the map's unit."""
+        known = scale_camera(camera or self.view, *found.size, setting="camera")
+        return self.localizer.locate(make_query(found, known), prior)
+
+    def find_inliers(
+        self, answer: MapAnswer, found: Keypoints, camera: Camera | None, size: tuple[int, int]
+    ) -> np.ndarray | None:
+        """(K, 2) float32 pixels of the keypoints of inliers, in the image of this size before it was enlarged."""
+        if answer.shown is None:
+            return None
+        seen = self.localizer.map.camera_correction.distort(answer.shown.observed[answer.shown.inlier])
+        pixels = scale_camera(camera or self.view, *found.size).project(seen)
+        return ((pixels + 0.5) * (np.array(size) / found.size) - 0.5).astype(np.float32)
 
     def measure_certainty(self, answer: MapAnswer) -> tuple[float, float, np.ndarray | None]:
         """Radii that hold 90 % of errors, inf if refused; and the covariance as a `LocatedPose` has it."""

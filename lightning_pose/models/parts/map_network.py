@@ -10,6 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
+from lightning_pose.geometry.absolute_pose import CameraPose
 from lightning_pose.geometry.camera import Camera
 from lightning_pose.mapping.calibration import Calibration
 from lightning_pose.mapping.frames import MapFrames
@@ -120,12 +121,15 @@ class MapNetwork(nn.Module):
         coefficients = tuple(distortion[:4] if fisheye else distortion) if any(distortion) else ()
         return Camera(int(width), int(height), fx, fy, cx, cy, coefficients, bool(fisheye))
 
-    def locate(self, features: Tensor, cameras: Sequence[Camera] | None = None) -> list[MapAnswer]:
+    def locate(
+        self, features: Tensor, cameras: Sequence[Camera] | None = None, prior: CameraPose | None = None
+    ) -> list[MapAnswer]:
         """Answers for (B, N, D + 4) features.
 
         Args:
             features: of B images.
             cameras: B, each for its image as it is; `view` for all if None.
+            prior: where all may have been taken, in the given poses' unit and origin.
 
         Raises:
             RuntimeError: there is no map yet.
@@ -137,7 +141,7 @@ class MapNetwork(nn.Module):
         nowhere = np.zeros((len(features), 3))
         cameras = [self.view] * len(features) if cameras is None else cameras
         frames = keypoints_to_frames(features, cameras, np.zeros((len(features), 3, 3)), nowhere)
-        return [self._localizer.locate(frames.query(i)) for i in range(len(frames))]
+        return [self._localizer.locate(frames.query(i), prior) for i in range(len(frames))]
 
     def find_radii(self, answers: list[MapAnswer]) -> tuple[np.ndarray, np.ndarray]:
         """(N,) radii, in the scene's unit and in degrees, that hold 90 % of the errors of accepted answers.
