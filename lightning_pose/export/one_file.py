@@ -24,6 +24,9 @@ WIDTH = 120
 ALLOWED = {"numpy", "cv2", "onnxruntime"}
 """Packages that the file may import, beside Python's own."""
 
+CONTENTS = "CONTENTS"
+"""In the head, this is replaced by a list of the file's parts."""
+
 SHAPED = re.compile(r'Float\[np\.ndarray, "[^"]*"\]')
 
 
@@ -143,7 +146,8 @@ class _Collector:
                         raise ValueError(f"{name} and {owner[defined]} both define {defined}; rename one")
                 parts.append(module.statements[number].text)
         text = "\n\n".join([*parts, tail])
-        return re.sub(r"\n\n(?=(?:@|class |def |# -----))", "\n\n\n", SHAPED.sub("np.ndarray", text)) + "\n"
+        text = re.sub(r"\n\n(?=(?:@|class |def |# -----))", "\n\n\n", SHAPED.sub("np.ndarray", text)) + "\n"
+        return text.replace(CONTENTS, _list_contents(text))
 
     def _write_imports(self) -> str:
         lines, joined = [], {}
@@ -157,6 +161,14 @@ class _Collector:
         for line in sorted(lines):
             by_package[line.split()[1].partition(".")[0] in ALLOWED].append(line)
         return "\n\n".join("\n".join(group) for group in by_package.values() if group)
+
+
+def _list_contents(text: str) -> str:
+    """A line for each headline: where it is, once this list is in the file."""
+    lines = text.splitlines()
+    rule = f"# {'-' * (WIDTH - 2)}"
+    found = [i for i in range(1, len(lines) - 1) if lines[i - 1] == lines[i + 1] == rule]
+    return "\n".join(f"{i + len(found):6}  {lines[i][2:].partition(':')[0][: WIDTH - 8]}" for i in found)
 
 
 def _write_headline(module: Module) -> str:

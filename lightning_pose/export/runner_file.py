@@ -27,8 +27,10 @@ HEAD = """Locates images with the model in this folder: needs numpy, OpenCV and,
     localizer = Localizer.load(FOLDER)
     pose = localizer.localize("image.jpg")            pose.position_m, pose.quat_wxyz, pose.status, ...
 
-`python -m lightning_pose export` has written this file, of modules of lightning_pose that are named above their parts.
-It is longer than a module should be, because it must stand alone.
+`python -m lightning_pose export` has written this file of modules of lightning_pose, word for word. It is longer than a
+module should be, because it must stand alone. Its parts, by their lines:
+
+CONTENTS
 """
 
 TAIL = """if __name__ == "__main__":

@@ -91,7 +91,7 @@ class ExportedSystem:
             self.features: Mapping[str, Any] = facts["features"]
             self.origin, self.scale = np.array(facts["world"]["origin"]), float(facts["world"]["scale"])
             self.keypoints = read_keypoint_settings(self.features) if "keypoints" in self.features else None
-            self.network = Network(folder / facts["network"]) if facts["network"] else None
+            self.network = Network(find_file(folder, facts["network"])) if facts["network"] else None
             self.map = ExportedMap(folder, facts["map"], self.scale) if facts["map"] else None
         except (KeyError, TypeError, ValueError) as error:
             raise CheckpointError(f"{folder}/localizer.json lacks {error}; export the model again") from error
@@ -241,7 +241,7 @@ class ExportedMap:
         self.view = Camera(**camera | {"distortion": tuple(camera["distortion"])})
         self.factors = [math.nan if factor is None else float(factor) for factor in facts["calibration"]]
         self.scale = scale
-        self.localizer = MapLocalizer(PointMap(**read_tensors(folder / facts["file"])))
+        self.localizer = MapLocalizer(PointMap(**read_tensors(find_file(folder, facts["file"]))))
 
     def locate(self, found: Keypoints, camera: Camera | None, prior: CameraPose | None) -> MapAnswer:
         """Where an image with these keypoints was taken; the prior is in the map's unit."""
@@ -269,6 +269,19 @@ class ExportedMap:
         change[:3, 3:] = np.eye(3) * factors[0] * self.scale
         change[3:, :3] = answer.pose_in_map.rotation * factors[1]
         return radius_m, radius_deg, change @ answer.covariance @ change.T
+
+
+def find_file(folder: Path, name: str) -> Path:
+    """A file that `localizer.json` names.
+
+    Raises:
+        CheckpointError: it is not directly in the folder.
+    """
+    if Path(name).name != name:
+        raise CheckpointError(
+            f"{folder}/localizer.json names a file outside the folder: {name}; export the model again"
+        )
+    return folder / name
 
 
 def read_keypoint_settings(facts: Mapping[str, Any]) -> KeypointSettings:
