@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -82,13 +81,11 @@ def measure_angle_deg(a: LocatedPose, b: LocatedPose) -> float:
 @contextmanager
 def load_runner(folder: Path) -> Iterator[ModuleType]:
     """The folder's `localizer.py`, which has just been written; folders of others are never run."""
-    spec = importlib.util.spec_from_file_location("lightning_pose_exported_localizer", folder / "localizer.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses look their module up
+    path = folder / "localizer.py"
+    module = ModuleType("exported_localizer")
+    sys.modules[module.__name__] = module  # dataclasses look their module up
     try:
-        spec.loader.exec_module(module)
+        exec(compile(path.read_text(encoding="utf-8"), path, "exec"), vars(module))  # an import would leave bytecode
         yield module
     finally:
-        del sys.modules[spec.name]
+        del sys.modules[module.__name__]

@@ -24,6 +24,7 @@ from lightning_pose.features import CNN
 from lightning_pose.localization.localizer import Localizer
 from lightning_pose.localization.located_pose import LocatedPose
 from lightning_pose.models import LinearPoseNet
+from tests.export.helpers import BACKBONE, COLUMNS
 from tests.rooms import MappedRoom
 
 
@@ -121,9 +122,9 @@ def test_the_verb_localize_reads_a_folder(
 
 def test_a_regressor_with_a_map_in_one_folder(mapped_room: MappedRoom, tmp_path: Path) -> None:
     pytest.importorskip("onnxscript", reason="the extra `export` is not installed")
-    extractor = CNN("efficientnet_lite0", "none", size=32, crop="whole")
+    extractor = CNN(BACKBONE, size=32, crop="whole")
     data = ImageDataModule(extractor, str(mapped_room.root), val_fraction=0, cache_dir=str(tmp_path / "cache"))
-    model = LinearPoseNet(input_shape=[1280], lambdas=[1.0], refine={"n_features": 150, "bundle_adjust": False})
+    model = LinearPoseNet(input_shape=[COLUMNS], lambdas=[1.0], refine={"n_features": 150, "bundle_adjust": False})
     trainer = Trainer(
         max_epochs=1, accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False,
         enable_model_summary=False,
@@ -131,14 +132,20 @@ def test_a_regressor_with_a_map_in_one_folder(mapped_room: MappedRoom, tmp_path:
     trainer.fit(model, datamodule=data)
     trainer.save_checkpoint(tmp_path / "refined.ckpt", weights_only=True)
     out = tmp_path / "out"
-    assert export(tmp_path / "refined.ckpt", "--out", out, "--images", *mapped_room.images[:3]) == 0
+    assert export(tmp_path / "refined.ckpt", "--out", out, "--images", *mapped_room.images[:3]) == 2
+    assert not out.exists(), "the checkpoint names a class of ours"
+    allow = ("--allow", BACKBONE)
+    assert export(tmp_path / "refined.ckpt", "--out", out, "--images", *mapped_room.images[:3], *allow) == 0
     assert {"model.onnx", "map.safetensors"} <= {file.name for file in out.iterdir()}
-    ours, theirs = Localizer.load(tmp_path / "refined.ckpt"), Localizer.load(out)
+    ours, theirs = Localizer.load(tmp_path / "refined.ckpt", allow=BACKBONE), Localizer.load(out)
     blank = np.full((240, 320, 3), 9, np.uint8)
     for image in (mapped_room.images[3], blank):
         check_same(ours.localize(image), theirs.localize(image))
     assert (theirs.localize(blank).source, theirs.localize(mapped_room.images[3]).source) == ("network", "map")
-    assert export(tmp_path / "refined.ckpt", "--out", tmp_path / "8", "--int8", "--images", mapped_room.images[0]) == 2
+    assert (
+        export(tmp_path / "refined.ckpt", "--out", tmp_path / "8", "--int8", "--images", mapped_room.images[0], *allow)
+        == 2
+    )
     assert not (tmp_path / "8").exists()
 
 

@@ -34,13 +34,14 @@ from lightning_pose.models import (
     SurfCNN,
     SurfLSTM,
 )
+from tests.export.helpers import BACKBONE, COLUMNS
 
 TRAINING = 30
 """Images that a model keeps something of."""
 
 
 def make_cnn(output: str = "vector") -> CNN:
-    return CNN("efficientnet_lite0", "none", output=output, size=32)  # type: ignore[arg-type]
+    return CNN(BACKBONE, output=output, size=32)  # type: ignore[arg-type]
 
 
 def fill(model: PoseModule, low: float = 0.0, high: float = 1.0) -> PoseModule:
@@ -74,14 +75,14 @@ IMAGES: dict[str, tuple[Callable[[], PoseModule], Callable[[], FeatureExtractor]
         lambda: SurfCNN(input_shape=[20, 64], units=8, channels=[4] * 5, ordered=False),
         lambda: SURF(20),
     ),
-    "LinearPoseNet": (lambda: LinearPoseNet(input_shape=[1280]), make_cnn),
-    "DensePoseNet": (lambda: DensePoseNet(input_shape=[1280], components=5), make_cnn),
-    "KernelPoseNet": (lambda: KernelPoseNet(input_shape=[1280]), make_cnn),
-    "NodePose": (lambda: NodePose(input_shape=[1280], neighbours=3, channels=[8, 8]), make_cnn),
-    "NodePose gcn": (lambda: NodePose(input_shape=[1280], neighbours=3, channels=[8, 8], conv="gcn"), make_cnn),
+    "LinearPoseNet": (lambda: LinearPoseNet(input_shape=[COLUMNS]), make_cnn),
+    "DensePoseNet": (lambda: DensePoseNet(input_shape=[COLUMNS], components=5), make_cnn),
+    "KernelPoseNet": (lambda: KernelPoseNet(input_shape=[COLUMNS]), make_cnn),
+    "NodePose": (lambda: NodePose(input_shape=[COLUMNS], neighbours=3, channels=[8, 8]), make_cnn),
+    "NodePose gcn": (lambda: NodePose(input_shape=[COLUMNS], neighbours=3, channels=[8, 8], conv="gcn"), make_cnn),
     "GraphPose": (
-        lambda: GraphPose(input_shape=[1280, 2, 2], channels=[8, 8], neighbours=2, places=True),
-        lambda: CNN("efficientnet_lite0", "none", output="map", size=64, crop="whole"),
+        lambda: GraphPose(input_shape=[COLUMNS, 4, 4], channels=[8, 8], neighbours=2, places=True),
+        lambda: CNN(BACKBONE, output="map", size=64, crop="whole"),
     ),
     "PoseNet": (
         lambda: PoseNet(input_shape=[3, 40, 52], crop=32, weights="none", units=8),

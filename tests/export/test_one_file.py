@@ -41,6 +41,14 @@ def test_every_name_of_the_runner_is_defined_once() -> None:
     assert "lightning_pose" not in {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
 
 
+def test_the_list_of_parts_names_their_lines() -> None:
+    lines = write_runner().splitlines()
+    listed = [line.split(maxsplit=1) for line in lines[: lines.index('"""')] if line[:6].strip().isdigit()]
+    assert len(listed) > 20
+    for number, title in listed:
+        assert lines[int(number) - 1].startswith(f"# {title[:60]}")
+
+
 def test_definitions_come_with_what_they_use_and_what_documents_them() -> None:
     text = join_modules(["lightning_pose.mapping.point_map.quantize_descriptors"], {}, "Head.", "# tail")
     assert text.startswith('"""Head."""\n\nfrom __future__ import annotations\n\nimport numpy as np\n')
