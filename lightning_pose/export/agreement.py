@@ -85,7 +85,8 @@ def load_runner(folder: Path) -> Iterator[ModuleType]:
     module = ModuleType("exported_localizer")
     sys.modules[module.__name__] = module  # dataclasses look their module up
     try:
-        exec(compile(path.read_text(encoding="utf-8"), path, "exec"), vars(module))  # an import would leave bytecode
+        code = compile(path.read_text(encoding="utf-8"), path, "exec")
+        exec(code, vars(module))  # noqa: S102  # an import would leave bytecode; `export` has just written the file
         yield module
     finally:
         del sys.modules[module.__name__]

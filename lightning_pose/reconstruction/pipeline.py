@@ -122,7 +122,7 @@ def choose_and_write(
         measures = measure_frames(progress.track(source.read_gray(), "choosing frames", source.count or None))
         count = len(measures.motion)
         every_name = source.list_names(count)
-        rows = {find_frame(name, every_name) for name in wanted} - {None}
+        rows = {row for name in wanted if (row := find_frame(name, every_name)) is not None}
         every = 1 if every is None and not source.is_video and count <= FEW_PHOTOS else every
         chosen = sorted({*choose_frames(measures, every).tolist(), *rows})
         kept = {"chosen": chosen, "count": count}
