@@ -27,7 +27,7 @@ from tests.helpers import REPOSITORY, Workplace
 PAGES = sorted([*REPOSITORY.glob("*.md"), *(REPOSITORY / "docs").glob("*.md")])
 PROGRAM = "python -m lightning_pose "
 SHELL = ("uv", "python", "mlflow", "bash", "docker", "curl", "pip")
-DATED = re.compile(r"\b[Rr]un on 20\d\d-\d\d-\d\d")
+DATED = re.compile(r"\b[Rr]un on 20\d\d-\d\d-\d\d|has not been built yet")
 CHECKPOINT = REPOSITORY / "tests" / "checkpoints" / "surf_lstm_0_1.ckpt"
 SYSTEMS = ("linear_posenet", "surf_lstm", "cnn_rnn")
 
@@ -47,6 +47,8 @@ ELSEWHERE = {
     f"{PROGRAM}fit --config configs/cnn_rnn.yaml": "test_configs.py",
     f"{PROGRAM}fit --config configs/surf_lstm.yaml --data.root DIR --ckpt_path last": "test_cli.py",
     f"{PROGRAM}fit --config configs/surf_lstm.yaml --data.root DIR --trainer.devices 2": "runs/test_devices.py",
+    f"{PROGRAM}check dataset": "commands/test_check.py",
+    f"{PROGRAM}fit --config configs/landmark_map.yaml --data.root dataset": "test_configs.py",
     f"{PROGRAM}predict --ckpt_path FILE --allow my_package.MyNet": "test_trust.py",
     "mlflow ui --backend-store-uri sqlite:///mlruns/mlflow.db": "runs/test_mlflow_ui.py",
 }

@@ -9,6 +9,8 @@ from typing import TypeVar
 import numpy as np
 import torch
 
+from lightning_pose.threads import use_one_thread
+
 __all__ = ["map_in_threads", "multiply"]
 
 Item = TypeVar("Item")
@@ -21,15 +23,12 @@ def map_in_threads(work: Callable[[Item], Result], items: Iterable[Item]) -> lis
     Each item is worked on by one thread: torch's own threads, which share out single products and sums, gain nothing on
     the small arrays of a map, and more of them than cores take several times as long.
     """
-    threads = torch.get_num_threads()
-    if threads == 1:
-        return [work(item) for item in items]
-    torch.set_num_threads(1)
-    try:
-        with ThreadPoolExecutor(threads) as pool:
+    items = list(items)
+    with use_one_thread() as threads:
+        if min(threads, len(items)) < 2:
+            return [work(item) for item in items]
+        with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
             return list(pool.map(work, items))
-    finally:
-        torch.set_num_threads(threads)
 
 
 def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -164,7 +164,7 @@ def align_positions(
     spread = np.linalg.svd(new - new.mean(axis=0), compute_uv=False)
     if spread[1] < NARROW * spread[0]:
         log.warning(
-            "--align: the %d known positions are nearly on one line, which leaves the rotation about it uncertain; give "
+            "--align: the %d known positions are nearly on one line, so that the rotation about it is uncertain; give "
             "one that is farther beside it",
             len(used),
         )

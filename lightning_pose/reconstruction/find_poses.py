@@ -80,6 +80,7 @@ def _map_frames(
     shutil.copyfile(workspace.database, database)  # the mapper changes focal lengths and geometries
     with progress.wait(f"finding poses ({method} mapper)"):
         folders = run_mapper(method, database, out, threads, fixed)
+    database.unlink()
     models = [pycolmap.Reconstruction(folder) for folder in folders]
     models.sort(key=lambda model: -model.num_reg_images())
     if not models:
