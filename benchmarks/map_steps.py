@@ -79,7 +79,7 @@ def take_first_descriptor(sum_by_track: Callable) -> Callable:
 
 def match_once(matcher: QueryMatcher, query: MapQuery, points: np.ndarray, pose: CameraPose):
     """The matches that RANSAC agreed with, in place of those of the guided pass."""
-    _, rows, matched = matcher.match_candidates(query)
+    _, rows, matched = matcher.match_candidates(query.descriptors)
     local = (matcher.map.points[matched] - pose.position) @ pose.rotation
     with np.errstate(divide="ignore", invalid="ignore"):
         off = np.linalg.norm(local[:, :2] / local[:, 2:] - points[rows], axis=1) * query.focal_px
