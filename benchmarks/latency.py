@@ -29,6 +29,7 @@ def main() -> None:
     parser.add_argument("systems", nargs="+", metavar="NAME=CHECKPOINT:FOLDER")
     parser.add_argument("--images", type=int, default=20)
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--runs", type=int, default=3, help="processes that are timed from their start")
     parser.add_argument("--python", default=sys.executable, help="of an environment without torch, for the folders")
     parser.add_argument("--ask", choices=("torch", "folder"), help=argparse.SUPPRESS)
     args = parser.parse_args()
@@ -46,8 +47,8 @@ def main() -> None:
         in_torch = run([sys.executable, *ask, "torch", checkpoint, *images])
         exported = run([args.python, *ask, "folder", folder, *images])
         first = [
-            time_process([sys.executable, "-m", "lightning_pose", "localize", checkpoint, images[0]]),
-            time_process([args.python, str(Path(folder) / "localizer.py"), images[0]]),
+            time_process([sys.executable, "-m", "lightning_pose", "localize", checkpoint, images[0]], args.runs),
+            time_process([args.python, str(Path(folder) / "localizer.py"), images[0]], args.runs),
         ]
         size = sum(file.stat().st_size for file in Path(folder).iterdir())
         print(f"| {name} | {in_torch} | {exported} | {first[0]:.2f} | {first[1]:.2f} | {size:,} |", flush=True)
@@ -69,7 +70,7 @@ def run(command: list[str]) -> str:
     return found.stdout.strip()
 
 
-def time_process(command: list[str], runs: int = 3) -> float:
+def time_process(command: list[str], runs: int) -> float:
     """CPU seconds of a whole process, the least of some runs."""
     seconds = []
     for _ in range(runs):
