@@ -207,7 +207,7 @@ def test_options_in_the_text_exist(capsys: pytest.CaptureFixture[str]) -> None:
         for page in PAGES
         for span in re.findall(r"`([^`\n]*)`", page.read_text())
         if not span.startswith(SHELL)
-        for option in re.findall(r"(?<!\S)\[?(--[a-z][\w.]+)", span)
+        for option in re.findall(r"(?<!\S)\[?(--[a-z][\w.-]+)", span)
     }
     assert len(named) > 20
     assert sorted(named - known) == []
