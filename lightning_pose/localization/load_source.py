@@ -40,8 +40,10 @@ def load_system(source: str | Path, allow: Sequence[str] = (), tracking_uri: str
 
 
 def _load_exported(folder: Path) -> LocatingSystem:
-    """The system of a folder that `export` wrote, without torch."""
-    raise ConfigError(f"{folder} is an exported folder, which this version cannot load; give the checkpoint")
+    """The system of a folder that `export` wrote, without torch; code in the folder is not run."""
+    from lightning_pose.export.runner.system import ExportedSystem
+
+    return ExportedSystem(folder)
 
 
 def find_checkpoint(source: str | Path, tracking_uri: str | None = None) -> Path:

@@ -314,7 +314,7 @@ def _log_model(logger: MLflowLogger, checkpoint: Path, allow: list[str], example
 
     from lightning_pose.localization.mlflow_signature import SIGNATURE
 
-    shown = {} if example is None else {"input_example": pd.DataFrame({"image": [_encode_jpeg(example)]})}
+    shown = None if example is None else pd.DataFrame({"image": [_encode_jpeg(example)]})
     with _keep_environment(), warnings.catch_warnings():
         # MLflow warns of columns of whole numbers that may be missing; these are only in the answer.
         warnings.simplefilter("ignore", UserWarning)
@@ -325,7 +325,7 @@ def _log_model(logger: MLflowLogger, checkpoint: Path, allow: list[str], example
                 python_model=str(PACKAGE / "localization" / "mlflow_model.py"),
                 artifacts={"checkpoint": str(checkpoint)},
                 signature=SIGNATURE,
-                **shown,
+                input_example=shown,
                 model_config={"allow": allow},
                 code_paths=[str(PACKAGE)],
                 pip_requirements=[f"{name}=={version(name)}" for name in REQUIREMENTS],

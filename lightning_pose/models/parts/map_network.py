@@ -16,6 +16,7 @@ from lightning_pose.mapping.calibration import Calibration
 from lightning_pose.mapping.frames import MapFrames
 from lightning_pose.mapping.map_localizer import MapAnswer, MapLocalizer
 from lightning_pose.mapping.point_map import PointMap
+from lightning_pose.mapping.threads import map_in_threads
 
 __all__ = ["MapNetwork", "keypoints_to_frames"]
 
@@ -146,7 +147,8 @@ class MapNetwork(nn.Module):
         nowhere = np.zeros((len(features), 3))
         cameras = [self.view] * len(features) if cameras is None else cameras
         frames = keypoints_to_frames(features, cameras, np.zeros((len(features), 3, 3)), nowhere)
-        return [self._localizer.locate(frames.query(i), prior) for i in range(len(frames))]
+        localizer = self._localizer
+        return map_in_threads(lambda i: localizer.locate(frames.query(i), prior), range(len(frames)))
 
     def find_radii(self, answers: list[MapAnswer]) -> tuple[np.ndarray, np.ndarray]:
         """(N,) radii, in the scene's unit and in degrees, that hold 90 % of the errors of accepted answers.
