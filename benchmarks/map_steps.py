@@ -121,7 +121,7 @@ def list_query_steps() -> dict[str, Callable[[], Patches]]:
     """What to replace while images are located, by the step that is left out."""
     query = query_matching
     return {
-        "carrying back": lambda: replace_all(MapLocalizer, carry_back=lambda self, pose: pose),
+        "carrying back": lambda: replace_all(MapLocalizer, carry_back=lambda self, pose, *turn: pose),
         "candidates (the whole map)": lambda: replace_all(query, CANDIDATES=10**6),
         "ratio tests of queries": lambda: replace_all(query, MATCH_RATIO=1.0, GUIDED_RATIO=1.0),
         "size check of queries": lambda: replace_all(query, SIZE_OCTAVES=99.0),
