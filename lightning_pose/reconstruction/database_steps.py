@@ -53,8 +53,8 @@ def match_all(
     def compute(
         task: tuple[int, int, Features, Features, tuple[pycolmap.Camera, pycolmap.Camera]],
     ) -> tuple[int, int, pycolmap.TwoViewGeometry]:
-        a, b, *features, cameras = task
-        return a, b, verify_pair(*features, cameras)
+        a, b, first, second, cameras = task
+        return a, b, verify_pair(first, second, cameras)
 
     found = 0
     for a, b, geometry in progress.track(_run_threads(compute, tasks, threads), step, len(missing)):
