@@ -1,15 +1,13 @@
-"""Work that several threads share, with the same result for any number of them."""
+"""Work that several threads share, with the same result for any number of them; torch only where it is there."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
 import numpy as np
-import torch
-
-from lightning_pose.threads import use_one_thread
 
 __all__ = ["map_in_threads", "multiply"]
 
@@ -23,6 +21,10 @@ def map_in_threads(work: Callable[[Item], Result], items: Iterable[Item]) -> lis
     Each item is worked on by one thread: torch's own threads, which share out single products and sums, gain nothing on
     the small arrays of a map, and more of them than cores take several times as long.
     """
+    import torch  # exported maps are asked without it
+
+    from lightning_pose.threads import use_one_thread
+
     items = list(items)
     with use_one_thread() as threads:
         if min(threads, len(items)) < 2:
@@ -33,4 +35,5 @@ def map_in_threads(work: Callable[[Item], Result], items: Iterable[Item]) -> lis
 
 def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """The product of matrices by as many threads as torch has here; numpy's own would be as many in each thread."""
-    return (torch.from_numpy(a) @ torch.from_numpy(b)).numpy()
+    torch = sys.modules.get("torch")
+    return a @ b if torch is None else (torch.from_numpy(a) @ torch.from_numpy(b)).numpy()
