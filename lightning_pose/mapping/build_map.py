@@ -18,7 +18,7 @@ from lightning_pose.geometry.triangulation import (
 from lightning_pose.mapping.bundle_adjustment import Adjustment, CameraCorrection, adjust_bundle
 from lightning_pose.mapping.depth_vote import vote_depths
 from lightning_pose.mapping.frames import MapFrames
-from lightning_pose.mapping.guided_matching import KeypointMatches, match_pairs
+from lightning_pose.mapping.guided_matching import match_pairs
 from lightning_pose.mapping.pairs import FEW_FRAMES, choose_pairs, estimate_depth
 from lightning_pose.mapping.point_map import PointMap, quantize_descriptors
 from lightning_pose.mapping.tracks import join_tracks
@@ -84,14 +84,12 @@ class MappedFrames:
         given: the frames with the poses that the dataset gives.
         seen: the same with the poses and keypoints of the map's own cameras.
         tracks: the map's points and their observations.
-        matches: those that the tracks are made of, and more.
         state: what bundle adjustment found, from which another goes on; None before the first.
     """
 
     given: MapFrames
     seen: MapFrames
     tracks: Tracks
-    matches: KeypointMatches
     state: Adjustment | None = None
 
     @property
@@ -113,27 +111,23 @@ def map_frames(frames: MapFrames, adjust: bool) -> MappedFrames:
         adjust: move poses, points and camera until they agree with the images, twice: poses that are better find
             more matches. Without it, the given poses are taken as they are.
     """
-    matches = match_frames(frames)
-    mapped = MappedFrames(frames, frames, triangulate_tracks(frames, find_tracks(frames, matches)), matches)
+    mapped = MappedFrames(frames, frames, triangulate_tracks(frames, find_tracks(frames)))
     return adjust_mapped(mapped) if adjust else mapped
 
 
 def adjust_mapped(mapped: MappedFrames) -> MappedFrames:
     """The same frames after bundle adjustment, twice, with new tracks between."""
-    given, seen, tracks, matches = mapped.given, mapped.seen, mapped.tracks, mapped.matches
+    given, seen, tracks = mapped.given, mapped.seen, mapped.tracks
     state = Adjustment(given.rotation, given.position, tracks.points)
     for again in range(ADJUSTMENTS):
         if again:
-            matches = match_frames(seen)
-            tracks = triangulate_tracks(seen, find_tracks(seen, matches))
+            tracks = triangulate_tracks(seen, find_tracks(seen))
         state, seen, tracks = _adjust_once(state, given, tracks)
-    return MappedFrames(given, seen, triangulate_tracks(seen, tracks), matches, state)
+    return MappedFrames(given, seen, triangulate_tracks(seen, tracks), state)
 
 
 def add_frames(mapped: MappedFrames, given: MapFrames, rows: np.ndarray, others: Sequence[CameraPose]) -> MappedFrames:
     """A map of more frames, whose old ones start where bundle adjustment has moved them: one round instead of two.
-
-    Matches between old frames are kept.
 
     Args:
         mapped: after bundle adjustment.
@@ -155,10 +149,9 @@ def add_frames(mapped: MappedFrames, given: MapFrames, rows: np.ndarray, others:
         position[row] = pose.position - rotation[row] @ old.offset_position
     start = replace(old, rotation=rotation, position=position)
     seen = _move_frames(start, given)
-    matches = replace(mapped.matches, frame=rows[mapped.matches.frame]).join(match_frames(seen, new))
-    tracks = triangulate_tracks(seen, find_tracks(seen, matches))
+    tracks = triangulate_tracks(seen, find_tracks(seen))
     state, seen, tracks = _adjust_once(start, given, tracks)
-    return MappedFrames(given, seen, triangulate_tracks(seen, tracks), matches, state)
+    return MappedFrames(given, seen, triangulate_tracks(seen, tracks), state)
 
 
 def _adjust_once(state: Adjustment, given: MapFrames, tracks: Tracks) -> tuple[Adjustment, MapFrames, Tracks]:
@@ -173,13 +166,9 @@ def _move_frames(state: Adjustment, given: MapFrames) -> MapFrames:
     return replace(given.with_poses(*state.camera_poses), points=points)
 
 
-def match_frames(frames: MapFrames, of: np.ndarray | None = None) -> KeypointMatches:
-    """Matches of frames with their partners: of all frames, or of those of these numbers."""
-    return match_pairs(frames, choose_pairs(frames, estimate_depth(frames.rotation, frames.position), of))
-
-
-def find_tracks(frames: MapFrames, matches: KeypointMatches) -> Tracks:
+def find_tracks(frames: MapFrames) -> Tracks:
     """Tracks of keypoints, at the least squares point of their rays."""
+    matches = match_pairs(frames, choose_pairs(frames, estimate_depth(frames.rotation, frames.position)))
     matches = matches.select(vote_depths(frames, matches))
     track, frame, keypoint = join_tracks(matches, frames.points.shape[1], count_observations(frames))
     n_tracks = int(track[-1]) + 1 if len(track) else 0

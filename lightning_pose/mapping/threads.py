@@ -6,12 +6,11 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
-import numpy as np
 import torch
 
 from lightning_pose.threads import use_one_thread
 
-__all__ = ["map_in_threads", "multiply"]
+__all__ = ["map_in_threads"]
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -29,8 +28,3 @@ def map_in_threads(work: Callable[[Item], Result], items: Iterable[Item]) -> lis
             return [work(item) for item in items]
         with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
             return list(pool.map(work, items))
-
-
-def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The product of matrices by as many threads as torch has here; numpy's own would be as many in each thread."""
-    return (torch.from_numpy(a) @ torch.from_numpy(b)).numpy()
