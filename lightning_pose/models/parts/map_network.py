@@ -117,8 +117,9 @@ class MapNetwork(nn.Module):
         """Take a map, the camera of queries that come without one, and the factors of its radii."""
         device = self.calibration.device
         for field in fields(point_map):
-            kind = MAP_SHAPES[field.name][1]
-            getattr(self, field.name).data = torch.from_numpy(getattr(point_map, field.name)).to(device, kind)
+            kind, values = MAP_SHAPES[field.name][1], torch.from_numpy(getattr(point_map, field.name))
+            rounded = values.to(STORED.get(field.name, kind)) if values.is_floating_point() else values
+            getattr(self, field.name).data = rounded.to(device, kind)
         lens = -len(camera.distortion) if camera.lens else int(camera.fisheye)
         numbers = [camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, lens]
         numbers += [*camera.distortion, *[0.0] * (8 - len(camera.distortion))]
