@@ -29,6 +29,7 @@ VERBS = {
         "tables of finished runs: systems by scenes, beside baselines and published rows",
     ),
     "check": ("lightning_pose.commands.check", "say what a dataset holds, and what is wrong with it"),
+    "export": ("lightning_pose.commands.export", "write a folder that locates images with no torch installed"),
     "export-map": ("lightning_pose.commands.export_map", "write a landmark map as a COLMAP model and as PLY"),
     "reconstruct": (
         "lightning_pose.commands.reconstruct",

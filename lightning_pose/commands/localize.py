@@ -99,11 +99,14 @@ class _Trail:
 
     milliseconds: list[float] = field(default_factory=list)
     position_m: list[np.ndarray] = field(default_factory=list)
+    down: np.ndarray = field(default_factory=lambda: np.zeros(3))
     accepted: list[bool] = field(default_factory=list)
 
     def add(self, pose: LocatedPose) -> None:
         self.accepted.append(pose.accepted)
         self.position_m.append(pose.position_m)
+        if pose.accepted:
+            self.down += pose.T_world_cam[:3, 1]
         if "total" in pose.milliseconds:
             self.milliseconds.append(pose.milliseconds["total"])
 
@@ -154,7 +157,7 @@ def _finish(localizer: Localizer, trail: _Trail, args: Namespace) -> None:
     position_m, accepted = np.array(trail.position_m), np.array(trail.accepted)
     points = localizer.system.read_map_points()
     args.draw.parent.mkdir(parents=True, exist_ok=True)
-    draw_trajectory(points, position_m, accepted, localizer.system.name).savefig(args.draw)
+    draw_trajectory(points, position_m, accepted, trail.down, localizer.system.name).savefig(args.draw)
 
 
 def _open_output(path: Path) -> TextIO:

@@ -40,8 +40,10 @@ def load_system(source: str | Path, allow: Sequence[str] = (), tracking_uri: str
 
 
 def _load_exported(folder: Path) -> LocatingSystem:
-    """The system of a folder that `export` wrote, without torch."""
-    raise ConfigError(f"{folder} is an exported folder, which this version cannot load; give the checkpoint")
+    """The system of a folder that `export` wrote, without torch; code in the folder is not run."""
+    from lightning_pose.export.runner.system import ExportedSystem
+
+    return ExportedSystem(folder)
 
 
 def find_checkpoint(source: str | Path, tracking_uri: str | None = None) -> Path:
@@ -89,7 +91,8 @@ def _download_checkpoint(address: str, tracking_uri: str | None) -> Path:
 
     store = prepare_store(tracking_uri)
     try:
-        folder = Path(download_artifacts(address, tracking_uri=store, registry_uri=store))
+        place = _find_registered(address, store)
+        folder = Path(download_artifacts(place, tracking_uri=store, registry_uri=store))
     except (MlflowException, OSError) as error:
         reason = mask_passwords(" ".join(str(error).split()))[:200]
         raise ConfigError(
@@ -100,3 +103,19 @@ def _download_checkpoint(address: str, tracking_uri: str | None) -> Path:
     if len(checkpoints) != 1:
         raise ConfigError(f"{address} has {len(checkpoints)} checkpoints where a model that `fit` logged has one")
     return checkpoints[0]
+
+
+def _find_registered(address: str, store: str) -> str:
+    """Where a registered model is kept; other addresses as they are.
+
+    MLflow looks for the name in the store of the process, whatever store it is given.
+    """
+    from mlflow import MlflowClient
+
+    named = re.fullmatch(r"models:/([^/@]+)(?:@(.+)|/(\d+))", address)
+    if named is None:
+        return address
+    client = MlflowClient(tracking_uri=store, registry_uri=store)
+    name, alias, version = named.groups()
+    number = client.get_model_version_by_alias(name, alias).version if alias else version
+    return client.get_model_version_download_uri(name, str(number))

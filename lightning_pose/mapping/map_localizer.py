@@ -26,9 +26,6 @@ INLIER_PX = 3.0
 ACCEPT_INLIERS = 20
 """Guided matches within 3 px that an accepted pose needs. With 12, poses came through that were metres off."""
 
-ACCEPT_NEAR_PRIOR = 12
-"""The same where the pose agrees with a prior."""
-
 PRIOR = (0.5, 30.0)
 """How far a pose may lie from a prior: in median depths of the map's points, and degrees."""
 
@@ -118,30 +115,28 @@ class MapLocalizer:
 
         Args:
             query: the image.
-            prior: where it may have been taken, in the poses that the dataset gives. Points that it should show there
-                are tried first; then the whole map. A pose that agrees with it needs fewer inliers, a pose that does
-                not is refused.
+            prior: where it may have been taken, in the poses that the dataset gives. A pose near it is accepted as
+                without. Where none is found, points that the image should show there are matched. A pose that is not
+                near it is refused.
         """
         points = self._camera.remove(query.points)
-        if prior is None:
-            return self._search(query, points)
-        near = self.carry_forward(prior)
-        tracked = self._track(query, points, near)
-        if tracked is not None and tracked.inliers >= ACCEPT_INLIERS:
-            return tracked
         found = self._search(query, points)
-        if found.accepted:
-            away, turned = self._measure_distance(found.pose_in_map, near)
-            if away <= PRIOR[0] and turned <= PRIOR[1]:
-                return found
+        if prior is None:
+            return found
+        near = self.carry_forward(prior)
+        away, turned = self._measure_distance(found.pose_in_map, near)
+        if found.accepted and away <= PRIOR[0] and turned <= PRIOR[1]:
+            return found
+        tracked = self._track(query, points, near)
+        if tracked is None and found.accepted:
             reason = f"contradicts the prior: {away:.1f} times the scene's median depth and {turned:.0f} degrees away"
-            found = replace(found, reason=reason)
+            return replace(found, reason=reason)
         return found if tracked is None else tracked
 
     def _track(self, query: MapQuery, points: np.ndarray, near: CameraPose) -> MapAnswer | None:
         """The accepted pose among the points that a pose of the map should show; None if there is none near it."""
         matches = self._matcher.match_guided(query, points, near, PRIOR_PX)
-        found = self._solve(query, points, (-1, *matches[:2]), ACCEPT_NEAR_PRIOR)
+        found = self._solve(query, points, (-1, *matches[:2]))
         if not found.accepted:
             return None
         away, turned = self._measure_distance(found.pose_in_map, near)
@@ -154,14 +149,13 @@ class MapLocalizer:
 
     def _search(self, query: MapQuery, points: np.ndarray) -> MapAnswer:
         """The pose among the points of the most similar training frames."""
-        return self._solve(query, points, self._matcher.match_candidates(query.descriptors), ACCEPT_INLIERS)
+        return self._solve(query, points, self._matcher.match_candidates(query.descriptors))
 
     def _solve(
         self,
         query: MapQuery,
         points: np.ndarray,
         matches: tuple[int, np.ndarray, np.ndarray],
-        accept: int,
     ) -> MapAnswer:
         """The pose on which most matches agree, after one guided pass and refinement.
 
@@ -169,7 +163,6 @@ class MapLocalizer:
             query: the image.
             points: (N, 2), its keypoints with the camera's error removed.
             matches: the frame whose pose holds where none is found, keypoints (K,) and points (K,).
-            accept: how many inliers an accepted pose needs.
         """
         frame, rows, matched = matches
         if len(rows) < MIN_MATCHES:
@@ -190,7 +183,7 @@ class MapLocalizer:
         projected = local[:, :2] / np.maximum(local[:, 2:], 1e-9)
         inlier = np.linalg.norm(projected - points[rows], axis=1) * query.focal_px <= INLIER_PX
         inliers = int(inlier.sum())
-        reason = "" if inliers >= accept else f"too few guided inliers: {inliers} of {visible} points in view"
+        reason = "" if inliers >= ACCEPT_INLIERS else f"too few guided inliers: {inliers} of {visible} points in view"
         return self._answer(refined, inliers, visible, reason, ShownPoints(seen, projected, points[rows], inlier))
 
     def _answer(self, refined: RefinedPose, inliers: int, visible: int, reason: str, shown: ShownPoints) -> MapAnswer:

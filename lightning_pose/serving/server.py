@@ -115,9 +115,12 @@ def run_server(server: uvicorn.Server, listener: socket.socket) -> None:
     def end(number: int, frame: FrameType | None) -> None:
         raise SystemExit(SIGTERM_EXIT)
 
-    before = signal.signal(signal.SIGTERM, end)  # uvicorn raises the signal again once it has stopped
+    # Uvicorn raises the signal again once it has stopped. Shells let background jobs ignore SIGINT, which it overrides.
+    handlers = {signal.SIGTERM: end, signal.SIGINT: signal.default_int_handler}
+    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
     try:
         server.run(sockets=[listener])
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
         listener.close()

@@ -21,6 +21,7 @@ from mlflow.exceptions import MlflowException
 from mlflow.models import Model
 from mlflow.pyfunc import PyFuncModel, scoring_server  # type: ignore[attr-defined]
 
+from lightning_pose.errors import ConfigError
 from lightning_pose.localization.localizer import Localizer
 from lightning_pose.localization.located_pose import stack_poses
 from tests.helpers import REPOSITORY, Trained
@@ -109,8 +110,14 @@ def test_a_registered_model_has_an_alias(trained: Trained, images: list[Path], t
     version = mlflow.register_model(f"runs:/{trained.run.info.run_id}/model", "wall").version
     mlflow.MlflowClient().set_registered_model_alias("wall", "champion", version)
     poses = mlflow.pyfunc.load_model("models:/wall@champion").predict(make_table(images[:1]))
+    mlflow.set_tracking_uri(trained.workplace.uri)  # which does not have the name
     expected = Localizer.load("models:/wall@champion", allow="tests", tracking_uri=uri).localize(images[0])
     np.testing.assert_allclose(poses[POSE[:3]].to_numpy()[0], expected.position_m)
+    by_number = Localizer.load(f"models:/wall/{version}", allow="tests", tracking_uri=uri).localize(images[0])
+    np.testing.assert_array_equal(by_number.position_m, expected.position_m)
+    for address in ("models:/wall@nobody", "models:/wall/7", "models:/floor/1", "models:/wall"):
+        with pytest.raises(ConfigError, match=f"has no model {address} "):
+            Localizer.load(address, tracking_uri=uri)
 
 
 @pytest.fixture(scope="module")
