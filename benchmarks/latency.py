@@ -4,13 +4,15 @@
 
 Images are test frames of the checkpoint's run. A model of clips gets them one after the other, as a live camera gives
 them. Each system is asked in a process of its own with one thread; the first image is not counted. Prints a Markdown
-table of the median over images and rounds, and of the seconds of a whole process from its start to the first pose.
+table of the median over images and rounds, and of a whole process from its start to the first pose. All are CPU time,
+which with one thread is the time on an idle core, and does not count what else the computer does.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import resource
 import statistics
 import subprocess
 import sys
@@ -27,6 +29,7 @@ def main() -> None:
     parser.add_argument("systems", nargs="+", metavar="NAME=CHECKPOINT:FOLDER")
     parser.add_argument("--images", type=int, default=20)
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--runs", type=int, default=3, help="processes that are timed from their start")
     parser.add_argument("--python", default=sys.executable, help="of an environment without torch, for the folders")
     parser.add_argument("--ask", choices=("torch", "folder"), help=argparse.SUPPRESS)
     args = parser.parse_args()
@@ -44,8 +47,8 @@ def main() -> None:
         in_torch = run([sys.executable, *ask, "torch", checkpoint, *images])
         exported = run([args.python, *ask, "folder", folder, *images])
         first = [
-            time_process([sys.executable, "-m", "lightning_pose", "localize", checkpoint, images[0]]),
-            time_process([args.python, str(Path(folder) / "localizer.py"), images[0]]),
+            time_process([sys.executable, "-m", "lightning_pose", "localize", checkpoint, images[0]], args.runs),
+            time_process([args.python, str(Path(folder) / "localizer.py"), images[0]], args.runs),
         ]
         size = sum(file.stat().st_size for file in Path(folder).iterdir())
         print(f"| {name} | {in_torch} | {exported} | {first[0]:.2f} | {first[1]:.2f} | {size:,} |", flush=True)
@@ -67,13 +70,14 @@ def run(command: list[str]) -> str:
     return found.stdout.strip()
 
 
-def time_process(command: list[str], runs: int = 3) -> float:
-    """Seconds of a whole process, the least of some runs."""
+def time_process(command: list[str], runs: int) -> float:
+    """CPU seconds of a whole process, the least of some runs."""
     seconds = []
     for _ in range(runs):
-        started = time.perf_counter()
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
         run(command)
-        seconds.append(time.perf_counter() - started)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        seconds.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
     return min(seconds)
 
 
@@ -87,9 +91,9 @@ def measure_in_process(kind: str, source: str, images: list[str], rounds: int) -
     milliseconds = []
     for _ in range(rounds):
         for image in images:
-            started = time.perf_counter()
+            started = time.process_time()
             locate(image)
-            milliseconds.append(1e3 * (time.perf_counter() - started))
+            milliseconds.append(1e3 * (time.process_time() - started))
     return f"{statistics.median(milliseconds):.1f}"
 
 
