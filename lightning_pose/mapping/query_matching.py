@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import sys
-
 import numpy as np
 
 from lightning_pose.geometry.absolute_pose import CameraPose
 from lightning_pose.mapping.frames import MapQuery, find_distance_scale
 from lightning_pose.mapping.point_map import PointMap
+from lightning_pose.mapping.threads import multiply
 
 __all__ = ["QueryMatcher"]
 
@@ -52,7 +51,7 @@ class QueryMatcher:
         self.map = point_map
         self._descriptors = point_map.unit_descriptors
         self._main_axes = find_main_axes(self._descriptors, VOTE_COLUMNS)
-        self._few_columns = _multiply(self._main_axes.T, self._descriptors.T)
+        self._few_columns = multiply(self._main_axes.T, self._descriptors.T)
         length = np.bincount(point_map.seen_point, minlength=len(point_map))
         self._vote = 1 / np.sqrt(np.maximum(length, 1))
         self._points_of_frame = point_map.seen_count.astype(np.int64)
@@ -75,7 +74,7 @@ class QueryMatcher:
         if not len(descriptors) or not len(self._descriptors):
             return -1, NONE, NONE
         rows = np.arange(len(descriptors))
-        nearest = _multiply(_multiply(descriptors, self._main_axes), self._few_columns).argmax(axis=1)
+        nearest = multiply(multiply(descriptors, self._main_axes), self._few_columns).argmax(axis=1)
         voted = nearest[self._compare(descriptors, rows, nearest) > 1 - VOTE_DISTANCE**2 / 2]
         first, last = self._first_of_point[voted], self._first_of_point[voted + 1]
         votes = np.bincount(
@@ -88,7 +87,7 @@ class QueryMatcher:
         points = np.flatnonzero(likely)
         if len(points) < 2:
             return int(best[0]), NONE, NONE
-        among = _multiply(descriptors, self._descriptors[points].T)
+        among = multiply(descriptors, self._descriptors[points].T)
         best_point = among.argmax(axis=1)
         value = among[rows, best_point]
         mutual = among.max(axis=0)[best_point] == value
@@ -141,19 +140,9 @@ class QueryMatcher:
         return similarity if scale == 1 else 1 - (1 - similarity) / scale**2
 
 
-def _multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The product of matrices, by torch where it is in use, so that a thread of many computes it alone.
-
-    numpy would take as many threads again for each of them, which spin while they wait. A localizer without torch has
-    numpy alone.
-    """
-    torch = sys.modules.get("torch")
-    return a @ b if torch is None else (torch.from_numpy(a) @ torch.from_numpy(b)).numpy()
-
-
 def find_main_axes(descriptors: np.ndarray, count: int) -> np.ndarray:
     """(D, count or D) float32, the axes along which (P, D) descriptors are longest, in all."""
-    _, axes = np.linalg.eigh(_multiply(descriptors.T, descriptors).astype(np.float64))
+    _, axes = np.linalg.eigh(multiply(descriptors.T, descriptors).astype(np.float64))
     return np.ascontiguousarray(axes[:, ::-1][:, :count], dtype=np.float32)
 
 
