@@ -89,8 +89,7 @@ def load_runner(folder: Path) -> Iterator[ModuleType]:
     module = module_from_spec(spec)
     sys.modules[spec.name] = module  # dataclasses look their module up
     try:
-        code = compile(path.read_text(encoding="utf-8"), path, "exec")
-        exec(code, vars(module))  # noqa: S102  # an import would leave bytecode; `export` has just written the file
+        loader.exec_module(module)
         yield module
     finally:
         del sys.modules[spec.name]
