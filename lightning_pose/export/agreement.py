@@ -6,6 +6,8 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib.machinery import SourceFileLoader
+from importlib.util import module_from_spec, spec_from_loader
 from pathlib import Path
 from types import ModuleType
 
@@ -81,12 +83,20 @@ def measure_angle_deg(a: LocatedPose, b: LocatedPose) -> float:
 @contextmanager
 def load_runner(folder: Path) -> Iterator[ModuleType]:
     """The folder's `localizer.py`, which has just been written; folders of others are never run."""
-    path = folder / "localizer.py"
-    module = ModuleType("exported_localizer")
-    sys.modules[module.__name__] = module  # dataclasses look their module up
+    loader = _Uncached("exported_localizer", str(folder / "localizer.py"))
+    spec = spec_from_loader(loader.name, loader)
+    assert spec is not None
+    module = module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look their module up
     try:
-        code = compile(path.read_text(encoding="utf-8"), path, "exec")
-        exec(code, vars(module))  # noqa: S102  # an import would leave bytecode; `export` has just written the file
+        loader.exec_module(module)
         yield module
     finally:
-        del sys.modules[module.__name__]
+        del sys.modules[spec.name]
+
+
+class _Uncached(SourceFileLoader):
+    """Loads a file, and leaves no bytecode beside it."""
+
+    def set_data(self, path: str, data: bytes, *, _mode: int = 0o666) -> None:
+        """Python would write the bytecode here."""

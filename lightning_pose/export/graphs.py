@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from lightning_pose.errors import ConfigError
-from lightning_pose.export.recurrent import LSTMOverTime
+from lightning_pose.export.recurrent import RecurrentClips
 from lightning_pose.features import CNN, FeatureExtractor
 from lightning_pose.geometry.quaternions import quat_normalize
 from lightning_pose.models import CNNRNN, GraphPose, NodePose, PoseModule, SurfCNN
@@ -66,8 +66,9 @@ class PoseGraph(nn.Module):
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         features = self.features(image)
         position, quat_raw = self.decode(features)
-        radii = self.radius(features) if self.radius is not None else (self.origin[:1] + torch.nan,) * 2
-        return position.double() * self.scale + self.origin, quat_normalize(quat_raw), *radii
+        unknown = self.origin[:1] + torch.nan
+        radius_m, radius_deg = (unknown, unknown) if self.radius is None else self.radius(features)
+        return position.double() * self.scale + self.origin, quat_normalize(quat_raw), radius_m, radius_deg
 
 
 class ClipGraph(nn.Module):
@@ -83,7 +84,7 @@ class ClipGraph(nn.Module):
     def __init__(self, model: ClipModule) -> None:
         super().__init__()
         self.model = model
-        self.lstm = LSTMOverTime(model.network.lstm) if isinstance(model, CNNRNN) else None
+        self.recurrent = RecurrentClips(model.network) if isinstance(model, CNNRNN) else None
         self.scale = model.world_frame.scale
 
     def forward(self, clip: Tensor) -> tuple[Tensor, Tensor]:
@@ -93,12 +94,8 @@ class ClipGraph(nn.Module):
         else:
             read = model.standardize_input(clip)
         images = read.reshape(1, -1, *model.image_shape)
-        if self.lstm is not None and isinstance(model, CNNRNN):
-            frames = model.network.convolutions(images[0]).flatten(1)
-            poses = model.network.head(self.lstm(frames))[None]
-        else:
-            poses = model.network(images)
-        position, quat_raw = model.unscale_pose(poses)
+        network = model.network if self.recurrent is None else self.recurrent
+        position, quat_raw = model.unscale_pose(network(images))
         return position[0].double() * self.scale, quat_normalize(quat_raw[0])
 
 
@@ -126,17 +123,22 @@ class _Radius(nn.Module):
         for name in ("signs", "mean", "reference", "floor"):
             self.register_buffer(name, getattr(radius, name).float())
         self.factors = [factor or float("nan") for factor in radius.factors.tolist()]
+        self.pools: tuple[Tensor, Tensor] | None = None
         if len(radius.input_shape) == 3 and radius.input_shape[0] <= 4:
-            for name, size in zip(("rows", "columns"), radius.input_shape[1:], strict=True):
-                self.register_buffer(name, _make_pool(size))
+            _, height, width = radius.input_shape
+            self.pools = _make_pool(height), _make_pool(width).T
+
+    signs: Tensor
+    mean: Tensor
+    reference: Tensor
+    floor: Tensor
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
         features = features.float()
         if features.ndim == 3:
             features = features.sum(1)
         elif features.ndim == 4:
-            small = features.shape[1] <= 4
-            features = self.rows @ features @ self.columns.T if small else features.mean((2, 3))
+            features = features.mean((2, 3)) if self.pools is None else self.pools[0] @ features @ self.pools[1]
         keys = (F.normalize(features.flatten(1), dim=1) - self.mean) @ self.signs
         distance = (keys - self.reference).square().sum(1, keepdim=True).sqrt().amin(0)
         scale = (distance + self.floor).double()
@@ -169,13 +171,14 @@ class _UnorderedDecoder(nn.Module):
     def __init__(self, model: SurfCNN) -> None:
         super().__init__()
         self.model = model
+        self.convolutions, self.head = (model.network.get_submodule(name) for name in ("convolutions", "head"))
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        read, network = self.model.standardize_input(features), self.model.network
-        maps = network.convolutions(read.unsqueeze(1))
+        read = self.model.standardize_input(features)
+        maps = self.convolutions(read.unsqueeze(1))
         real = (read != 0).any(-1).to(maps.dtype)
         weight = torch.where(real.sum(1, keepdim=True) > 0, real, torch.ones_like(real))[:, None, :, None]
-        return self.model.unscale_pose(network.head((maps * weight).sum(2) / weight.sum(2)))
+        return self.model.unscale_pose(self.head((maps * weight).sum(2) / weight.sum(2)))
 
 
 class _NodeDecoder(nn.Module):
@@ -216,11 +219,13 @@ class _CellDecoder(nn.Module):
     def __init__(self, model: GraphPose) -> None:
         super().__init__()
         self.model = model
+        self.convolutions = list(model.network.get_submodule("convolutions").children())
+        self.heads = model.network.get_submodule("heads")
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
         maps, network = self.model.standardize_input(features), self.model.network
         _, _, h, w = maps.shape
-        count, k = h * w, min(network.neighbours, h * w - 1)
+        count, k = h * w, min(self.model.neighbours, h * w - 1)
         nodes = maps.flatten(2).transpose(1, 2)[0]
         squares = nodes.square().sum(1)
         squared = squares[:, None] + squares - 2 * nodes @ nodes.T + torch.diag(torch.full((count,), torch.inf))
@@ -229,10 +234,10 @@ class _CellDecoder(nn.Module):
         if network.places:
             grid = torch.cartesian_prod(torch.linspace(-1, 1, h), torch.linspace(-1, 1, w))
             nodes = torch.cat([nodes, grid.to(nodes.dtype)], dim=1)
-        for convolution in network.convolutions:
+        for convolution in self.convolutions:
             nodes = _convolve(convolution, nodes, nodes, edges, k).relu()
         return self.model.unscale_pose(
-            network.heads((nodes.mean(0) if network.readout == "mean" else nodes.amax(0))[None])
+            self.heads((nodes.mean(0) if network.readout == "mean" else nodes.amax(0))[None])
         )
 
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-__all__ = ["LSTMOverTime", "list_translations"]
+__all__ = ["RecurrentClips", "list_translations"]
 
 GATES = (0, 3, 1, 2)
 """Torch's gates (input, forget, cell, output) in the order of ONNX (input, output, forget, cell)."""
@@ -24,15 +25,18 @@ def _(frames: Tensor, weight: Tensor, recurrent: Tensor, bias: Tensor, units: in
     return frames.new_empty(frames.shape[0], len(weight) * units)
 
 
-class LSTMOverTime(nn.Module):
-    """One layer, in one or both directions, over (T, F) frames of one clip.
+class RecurrentClips(nn.Module):
+    """CNNRNN's network on one clip (1, T, C, H, W): convolutions over each frame, an LSTM over time, poses (1, T, 7).
 
     Args:
-        lstm: with its weights.
+        network: with its weights.
     """
 
-    def __init__(self, lstm: nn.LSTM) -> None:
+    def __init__(self, network: nn.Module) -> None:
         super().__init__()
+        self.convolutions, self.head = network.get_submodule("convolutions"), network.get_submodule("head")
+        lstm = network.get_submodule("lstm")
+        assert isinstance(lstm, nn.LSTM)
         assert lstm.num_layers == 1, "CNNRNN has one"
         self.units = lstm.hidden_size
         ends = ["_l0", "_l0_reverse"] if lstm.bidirectional else ["_l0"]
@@ -44,8 +48,9 @@ class LSTMOverTime(nn.Module):
     recurrent: Tensor
     bias: Tensor
 
-    def forward(self, frames: Tensor) -> Tensor:
-        return lstm_over_time(frames, self.weight, self.recurrent, self.bias, self.units)
+    def forward(self, clips: Tensor) -> Tensor:
+        frames = self.convolutions(clips[0]).flatten(1)
+        return self.head(lstm_over_time(frames, self.weight, self.recurrent, self.bias, self.units))[None]
 
 
 def _order_gates(weight: Tensor) -> Tensor:
@@ -55,9 +60,11 @@ def _order_gates(weight: Tensor) -> Tensor:
 
 def list_translations() -> dict[Callable[..., object], Callable[..., object]]:
     """What torch's exporter writes for the operators here."""
-    from onnxscript import opset20 as op
+    from onnxscript import opset20
 
-    def write_lstm(frames, weight, recurrent, bias, units):  # onnxscript's own types
+    op: Any = opset20  # its types are those of ONNX, which checkers do not know
+
+    def write_lstm(frames: Any, weight: Any, recurrent: Any, bias: Any, units: int) -> Any:
         directions = weight.shape[0]
         states, _, _ = op.LSTM(
             op.Unsqueeze(frames, op.Constant(value_ints=[1])),

@@ -15,6 +15,7 @@ REPLACED = {
     "lightning_pose.localization.inputs.ImageInput": "lightning_pose.export.runner.inputs.ImageInput",
     "lightning_pose.localization.inputs.list_images": "lightning_pose.export.runner.inputs.list_images",
     "lightning_pose.localization.inputs.load_image": "lightning_pose.export.runner.inputs.load_image",
+    "lightning_pose.mapping.threads.multiply": "lightning_pose.export.runner.products.multiply",
     "lightning_pose.localization.load_source.load_system": "lightning_pose.export.runner.system.load_system",
 }
 """What stands in for modules that need scipy, Pillow or torch."""

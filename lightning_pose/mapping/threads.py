@@ -21,7 +21,7 @@ def map_in_threads(work: Callable[[Item], Result], items: Iterable[Item]) -> lis
     Each item is worked on by one thread: torch's own threads, which share out single products and sums, gain nothing on
     the small arrays of a map, and more of them than cores take several times as long.
     """
-    import torch  # exported maps are asked without it
+    import torch  # a second; whoever only asks a map does without
 
     from lightning_pose.threads import use_one_thread
 
@@ -34,6 +34,12 @@ def map_in_threads(work: Callable[[Item], Result], items: Iterable[Item]) -> lis
 
 
 def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The product of matrices by as many threads as torch has here; numpy's own would be as many in each thread."""
-    torch = sys.modules.get("torch")
-    return a @ b if torch is None else (torch.from_numpy(a) @ torch.from_numpy(b)).numpy()
+    """The product of matrices by as many threads as torch has here; numpy's own would be as many in each thread.
+
+    Where nothing has imported torch, as when an exported folder is asked, it is numpy's.
+    """
+    if "torch" not in sys.modules:
+        return a @ b
+    import torch
+
+    return (torch.from_numpy(a) @ torch.from_numpy(b)).numpy()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -15,7 +16,16 @@ from lightning_pose.scenes.images import decode_image, read_bytes, to_gray
 
 __all__ = ["ImageInput", "list_images", "load_image"]
 
-ImageInput = object
+
+@runtime_checkable
+class PillowImage(Protocol):
+    """What is used of a PIL image, so that Pillow need not be there."""
+
+    def convert(self, mode: str) -> PillowImage: ...
+    def getexif(self) -> Any: ...
+
+
+ImageInput = str | Path | np.ndarray | PillowImage
 """One image: a file, a uint8 array (H, W) gray or (H, W, 3) RGB, or a PIL image."""
 
 ACCEPTED = "give an image file, a uint8 array (H, W) or (H, W, 3) RGB, a PIL image, or a list of these"
@@ -33,7 +43,7 @@ def list_images(images: object) -> Sequence[object] | None:
     Raises:
         ConfigError: it is neither.
     """
-    if isinstance(images, str | Path) or is_pixels(images) or hasattr(images, "convert"):
+    if isinstance(images, str | Path) or is_pixels(images) or isinstance(images, PillowImage):
         return None
     if isinstance(images, bytes | dict) or not isinstance(images, Iterable):
         raise ConfigError(f"images is {str(images)[:40]!r} ({type(images).__name__}); {ACCEPTED}")
@@ -58,7 +68,7 @@ def load_image(image: object, color: Color, number: int = 0) -> LoadedImage:
         data = read_bytes(path)
         return LoadedImage(decode_image(data, path, color == "rgb"), str(image), *parse_exif(data))
     facts: tuple[int, float | None] = 1, None
-    if hasattr(image, "convert"):
+    if isinstance(image, PillowImage):
         facts = parse_exif(EXIF_MARKS[0] + image.getexif().tobytes().removeprefix(EXIF_MARKS[0]))
         image = np.asarray(image.convert("RGB"))
     if not isinstance(image, np.ndarray) or not is_pixels(image) or image.dtype != np.uint8 or not image.size:

@@ -84,7 +84,7 @@ def extract_with_opencv(gray: np.ndarray, n: int, settings: KeypointSettings) ->
     order = np.lexsort((angle, size, x, y, -response))[:n]
     raw = raw[order]
     if raw.dtype == np.uint8:
-        raw = np.unpackbits(raw, axis=1, count=settings.columns) * np.float32(2) - 1
+        raw = np.unpackbits(raw.astype(np.uint8), axis=1, count=settings.columns) * np.float32(2) - 1
     norms = np.linalg.norm(raw, axis=1, keepdims=True)
     return rows[order], raw / np.maximum(norms, np.finfo(np.float32).tiny)
 

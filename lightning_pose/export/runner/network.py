@@ -53,12 +53,12 @@ class Network:
 
     def locate(self, image: np.ndarray) -> NetworkAnswer:
         """The answer for (H, W, 3) uint8 pixels, or for what `features` of the folder's `localizer.json` names."""
-        position_m, quat_wxyz, radius_m, radius_deg = self.session.run(None, {self.input: image})
+        position_m, quat_wxyz, radius_m, radius_deg = map(np.asarray, self.session.run(None, {self.input: image}))
         return NetworkAnswer(position_m[0], quat_wxyz[0].astype(np.float64), float(radius_m[0]), float(radius_deg[0]))
 
     def locate_clip(self, clip: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Positions (T, 3) and quaternions (T, 4), float64, of a clip (1, T, ...)."""
-        position_m, quat_wxyz = self.session.run(None, {self.input: clip})
+        position_m, quat_wxyz = map(np.asarray, self.session.run(None, {self.input: clip}))
         return position_m, quat_wxyz.astype(np.float64)
 
 
