@@ -21,6 +21,10 @@ MOST_WORSE = 0.05
 """By which share the median error on frames with known poses may grow."""
 
 
+MOST_BYTES = 0.9
+"""Share of its bytes that a network may keep; a smaller gain is not worth another file."""
+
+
 def shrink_network(folder: Path, network: str, frames: CheckFrames) -> Mapping[str, Any]:
     """Replace a folder's network by one of 8-bit weights.
 
@@ -42,6 +46,12 @@ def shrink_network(folder: Path, network: str, frames: CheckFrames) -> Mapping[s
     before, accepted = measure_errors(folder, frames)
     whole, small = folder / network, folder / f"{network}.int8"
     quantize_file(whole, small)
+    size = small.stat().st_size / whole.stat().st_size
+    if size > MOST_BYTES:
+        raise ConfigError(
+            f"--int8 leaves {size:.0%} of the network's bytes: onnxruntime has no 8-bit form of its largest layers; "
+            "leave it out"
+        )
     small.replace(whole)
     after, accepted_after = measure_errors(folder, frames)
     facts = {

@@ -33,6 +33,9 @@ EXTRA = "run `uv sync --extra export`, or `pip install onnx onnxscript onnxrunti
 CLIP_FRAMES = 5
 """Frames of the clip that a graph is traced with; it takes any number from 2."""
 
+LARGEST = 2**28
+"""Numbers in an array that is computed once and for all before weights are shrunk."""
+
 PREPARE = """
 <ir_version: {version}, opset_import: ["" : {opset}]>
 prepare (uint8[height, width, 3] image) => (float[1, 3, {side}, {side}] rgb)
@@ -203,7 +206,11 @@ def _make_preparation(extractor: CNN, version: int) -> ModelProto:
 
 def quantize_file(path: Path, out: Path) -> None:
     """Write a graph with its weights in 8 bits, and products in 8 bits where onnxruntime has them."""
+    import onnx
     from onnxruntime.quantization import QuantType, quantize_dynamic
+    from onnxscript import optimizer
 
     with _silence():
-        quantize_dynamic(path, out, weight_type=QuantType.QInt8, per_channel=True)
+        # Weights that the graph computes of others could not be shrunk.
+        folded = optimizer.optimize(onnx.load(path), input_size_limit=LARGEST, output_size_limit=LARGEST)
+        quantize_dynamic(folded, out, weight_type=QuantType.QInt8, per_channel=True)

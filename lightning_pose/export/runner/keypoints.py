@@ -126,12 +126,15 @@ def make_rows(found: Keypoints, settings: KeypointSettings) -> np.ndarray:
 
 def make_query(found: Keypoints, camera: Camera) -> MapQuery:
     """Keypoints as a map reads them; `camera` is for this image as it is."""
-    real = (found.descriptors != 0).any(axis=1)
-    geometry = found.geometry[real].astype(np.float64)
+    columns = found.descriptors.shape[1]
+    rows = make_rows(found, KeypointSettings("", len(found.descriptors), columns))
+    rows = rows[(rows[:, :columns] != 0).any(axis=1)]
+    x, y, log_size = rows[:, columns : columns + 3].astype(np.float64).T  # rounded, as those that the map is made of
+    pixels = np.stack([(x + 1) * camera.width / 2, (y + 1) * camera.height / 2], axis=-1)
     return MapQuery(
-        points=camera.normalize(geometry[:, :2]),
-        size_px=np.maximum(geometry[:, 2], 1.0).astype(np.float32),
-        descriptors=np.ascontiguousarray(found.descriptors[real]),
+        points=camera.normalize(pixels),
+        size_px=(16 * 2**log_size).astype(np.float32),
+        descriptors=np.ascontiguousarray(rows[:, :columns]),
         focal_px=camera.focal_px,
         half_view=camera.half_view,
     )

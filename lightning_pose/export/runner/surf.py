@@ -219,9 +219,11 @@ def refine_candidates(
     strict = (d.reshape(27, -1) < d[1, 1, 1]).sum(axis=0) == 26
     step = (1 << found.octave).astype(np.float32)
     size = ((9 + 6 * found.layer) << found.octave).astype(np.float32)
-    corner = (4 + 3 * found.layer).astype(np.float32)
-    x = (found.col - corner + offset[0]) * step + (size - 1) / 2
-    y = (found.row - corner + offset[1]) * step + (size - 1) / 2
+    # In float32 throughout, as torch has it: a rounding apart, and a descriptor's window moves by a pixel.
+    x, y = (
+        ((place - 4 - 3 * found.layer).astype(np.float32) + shift) * step + (size - 1) / 2
+        for place, shift in ((found.col, offset[0]), (found.row, offset[1]))
+    )
     return strict & inside, x, y, np.round(size + offset[2] * 6 * step)
 
 
