@@ -40,6 +40,7 @@ def main() -> None:
     args = parser.parse_args()
     files = sorted(path for path in args.images.rglob("*") if path.suffix in (".jpg", ".png"))
     images = [path.read_bytes() for path in islice(cycle(files), args.requests)]
+    os.environ["MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR"] = "false"
     port = find_free_port()
     with subprocess.Popen(make_command(args, port), start_new_session=True, stdout=subprocess.DEVNULL) as process:
         try:

@@ -43,7 +43,7 @@ Each image gives one line, as soon as it is located:
 Poses are camera-to-world, of the pixels as stored, in the scene's unit.
 
 In a video (or with --sequence) a map takes each pose as the prior of the next frame; a lost frame, and where the camera
-is found again, are said. An image that cannot be read is refused, and the others go on."""
+is found again, are said. An image or a video that cannot be read is refused, and the others go on."""
 
 EPILOG = """exit codes:
   0    every image was located and accepted
@@ -99,11 +99,14 @@ class _Trail:
 
     milliseconds: list[float] = field(default_factory=list)
     position_m: list[np.ndarray] = field(default_factory=list)
+    down: np.ndarray = field(default_factory=lambda: np.zeros(3))
     accepted: list[bool] = field(default_factory=list)
 
     def add(self, pose: LocatedPose) -> None:
         self.accepted.append(pose.accepted)
         self.position_m.append(pose.position_m)
+        if pose.accepted:
+            self.down += pose.T_world_cam[:3, 1]
         if "total" in pose.milliseconds:
             self.milliseconds.append(pose.milliseconds["total"])
 
@@ -154,7 +157,7 @@ def _finish(localizer: Localizer, trail: _Trail, args: Namespace) -> None:
     position_m, accepted = np.array(trail.position_m), np.array(trail.accepted)
     points = localizer.system.read_map_points()
     args.draw.parent.mkdir(parents=True, exist_ok=True)
-    draw_trajectory(points, position_m, accepted, localizer.system.name).savefig(args.draw)
+    draw_trajectory(points, position_m, accepted, trail.down, localizer.system.name).savefig(args.draw)
 
 
 def _open_output(path: Path) -> TextIO:
@@ -197,14 +200,27 @@ def _locate_sources(
 def _open_video(
     localizer: Localizer, camera: Camera | None, source: VideoSource, every: int
 ) -> tuple[str, Iterator[Located], int | None]:
-    """A video's name, the poses of its frames, and how many there are."""
+    """A video's name, the poses of its frames, and how many there are; a file that cannot be read is refused.
+
+    Raises:
+        ImageError: a camera cannot be opened.
+    """
+    from lightning_pose.localization.located_pose import refuse_image
     from lightning_pose.localization.video import VideoReader, VideoTracker
 
-    reader, tracker = VideoReader(source.source, every), VideoTracker(localizer, camera)
+    try:
+        reader, tracker = VideoReader(source.source, every), VideoTracker(localizer, camera)
+    except ImageError as error:
+        if isinstance(source.source, int):
+            raise
+        return source.source, iter([(refuse_image(source.source, str(error)), None)]), 1
 
     def locate_frames() -> Iterator[Located]:
-        for frame in reader:
-            yield replace(tracker.localize(frame.pixels, frame.time_s), image=frame.name), frame.pixels
+        try:
+            for frame in reader:
+                yield replace(tracker.localize(frame.pixels, frame.time_s), image=frame.name), frame.pixels
+        except ImageError as error:  # it opens, and has no frame
+            yield refuse_image(reader.name, str(error)), None
 
     return Path(reader.name).name, locate_frames(), reader.count
 

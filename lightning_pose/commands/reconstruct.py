@@ -51,7 +51,7 @@ def main(argv: list[str]) -> int:
     known = {} if args.align is None else read_positions(args.align)
     wanted = [*known] if distance is None else [distance.first, distance.second]
     source = open_source(args.source)
-    settings = {"source": source.list_facts(), "every": args.every, "camera": camera and str(camera), "frames": wanted}
+    settings = {"source": source.list_facts(), "every": args.every, "camera": camera and str(camera)}
     workspace = open_workspace(args.out, settings)
     if workspace.changed:
         print(f"{args.out} is of another {' and '.join(workspace.changed)}; it is made anew")

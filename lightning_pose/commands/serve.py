@@ -42,7 +42,7 @@ def main(argv: list[str]) -> int:
         from lightning_pose.serving.load_service import load_service
 
         service = load_service(args.model, args.allow)
-        _share_cores(limits.threads)
+        _use_one_core_each()
         app = create_app(service, limits, [args.host, *args.allow_host])
         host = f"[{args.host}]" if ":" in args.host else args.host
         print(f"{args.model} is served on http://{host}:{listener.getsockname()[1]}; Ctrl-C ends it", flush=True)
@@ -88,13 +88,12 @@ def _count_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _share_cores(threads: int) -> None:
-    """Let each of the server's threads compute with its share of the cores; more would fight for them."""
+def _use_one_core_each() -> None:
+    """Let each of the server's threads compute on one core: where more threads than cores compute, all wait."""
     import cv2
 
-    each = max(1, _count_cores() // threads)
-    cv2.setNumThreads(each)
+    cv2.setNumThreads(1)
     if "torch" in sys.modules:  # an exported folder does without
         import torch
 
-        torch.set_num_threads(each)
+        torch.set_num_threads(1)

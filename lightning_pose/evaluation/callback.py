@@ -20,7 +20,7 @@ from lightning_pose.models.parts.poses import Located
 from lightning_pose.runs.checkpoints import checkpoint_folder, run_logger
 from lightning_pose.runs.logger import MLflowLogger, log_localizer
 from lightning_pose.runs.tags import NOTE
-from lightning_pose.scenes.scene import Frame, Scene
+from lightning_pose.scenes.scene import Frame
 from lightning_pose.scenes.trajectory_files import write_sequences
 
 __all__ = ["TestReport", "describe_run"]
@@ -77,14 +77,8 @@ class TestReport(Callback):
         describe_run(logger, results_markdown(self.results, found.extras))
         best = checkpoint_folder(trainer) / "best.ckpt"
         if self.log_model and best.is_file():
-            log_localizer(logger, best, _find_example(scene))
+            log_localizer(logger, best, scene.frames[scene.splits["test"][0]].image)
         print(f"run {logger.run_id} in {logger.uri}")
-
-
-def _find_example(scene: Scene) -> Path | None:
-    """An image that shows what the model takes: the first test frame's."""
-    numbers = scene.splits["test"]
-    return scene.frames[numbers[0]].image if len(numbers) else None
 
 
 def _log_evaluation(logger: MLflowLogger, found: Evaluation) -> None:

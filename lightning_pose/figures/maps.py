@@ -129,24 +129,36 @@ def draw_map(
 
 @matplotlib.rc_context(STYLE)
 def draw_trajectory(
-    points: np.ndarray | None, position: np.ndarray, accepted: np.ndarray, title: str = "Trajectory"
+    points: np.ndarray | None,
+    position: np.ndarray,
+    accepted: np.ndarray,
+    down: np.ndarray | None = None,
+    title: str = "Trajectory",
 ) -> Figure:
-    """A located trajectory over the map's points, in the plane in which the camera moves most.
+    """A located trajectory over the map's points, from above.
 
-    Accepted images in a row are joined by a line; refused ones are crosses where they would be.
+    Accepted images in a row are joined by a line; refused ones are crosses, between those before and after them.
 
     Args:
         points: (P, 3), of the map; None without one.
         position: (N, 3), in order; nan where an image has no pose.
         accepted: (N,) bool.
+        down: (3,), mean of the cameras' down axes; the axis of the world nearest to it is not drawn. By default, the
+            axis along which the camera moves least.
         title: the heading.
     """
-    known = np.isfinite(position).all(axis=1)
-    cameras = position[known & accepted] if (known & accepted).any() else position[known]
-    cameras = cameras if len(cameras) else np.zeros((1, 3))
-    plane = across, up = find_longest_axes(cameras if len(cameras) > 1 or points is None else points)
-    points = cameras[:0] if points is None else points
-    held = np.concatenate([np.quantile(points, [0.02, 0.98], axis=0) if len(points) else cameras[:1], cameras])
+    rows = np.arange(len(position))
+    if accepted.any():
+        known = position[accepted]
+        position = np.column_stack([np.interp(rows, rows[accepted], column) for column in known.T])
+    else:
+        known = position[np.isfinite(position).all(axis=1)]
+        known = known if len(known) else np.zeros((1, 3))
+    points = known[:0] if points is None else points
+    plane = across, up = find_longest_axes(known)
+    if down is not None and down.any():
+        plane = across, up = [axis for axis in range(3) if axis != int(np.abs(down).argmax())]
+    held = np.concatenate([np.quantile(points, [0.02, 0.98], axis=0) if len(points) else known[:1], known])
     low, high = held.min(axis=0)[list(plane)], held.max(axis=0)[list(plane)]
     margin = 0.05 * (high - low).max() + SMALLEST
     figure = Figure(figsize=(8, 7), dpi=150, layout="constrained")

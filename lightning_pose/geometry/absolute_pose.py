@@ -100,7 +100,7 @@ def refine_pose(
         # Scaled to a unit diagonal: radians and the scene's unit differ by orders of magnitude.
         scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
         step = -scale * np.linalg.lstsq(normal * np.outer(scale, scale), right * scale, rcond=1e-12)[0]
-        rotation = rotation @ Rotation.from_rotvec(step[:3]).as_matrix()
+        rotation = rotation @ cv2.Rodrigues(step[:3])[0]  # several times as fast as scipy's `Rotation`
         position = position + step[3:]
         if np.abs(step[:3]).max() < 1e-7 and np.abs(step[3:]).max() < 1e-7 * float(np.median(z)):
             break

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -21,6 +22,9 @@ from lightning_pose.localization.video import VideoReader, VideoTracker
 from lightning_pose.scenes.cameras import has_shape
 
 __all__ = ["Localizer", "LocatingSystem", "Prior"]
+
+BLANK_SPREAD = 2.0
+"""Standard deviation of pixels, of 255, below which a network refuses an image; maps count features."""
 
 Prior = LocatedPose | tuple[np.ndarray, np.ndarray]
 """Where a camera is thought to be: an earlier answer, or position (3,) in the scene's unit and quaternion (4,) wxyz."""
@@ -213,7 +217,8 @@ class Localizer:
     def _locate_as_is(self, image: LoadedImage, camera: Camera | None, prior: CameraPose | None) -> LocatedPose:
         view = self.system.view
         if view is None:
-            return self.system.locate(image, None, None)
+            pose = self.system.locate(image, None, None)
+            return _refuse_blank(pose) if float(image.array.std()) < BLANK_SPREAD else pose
         found, notes = choose_camera(image, view, camera)
         pose = self.system.locate(image, found, prior)
         return replace(pose, notes=(*pose.notes, *notes)) if notes else pose
@@ -246,6 +251,11 @@ class Localizer:
         if self.system.view is None:
             raise ConfigError(f"{self.system.name} does not use a prior; leave prior out")
         return _parse_prior(prior)
+
+
+def _refuse_blank(pose: LocatedPose) -> LocatedPose:
+    """The pose that a network gives an image in which nothing is to be seen."""
+    return replace(pose, status="refused", reason="the image is blank", radius_m=math.inf, radius_deg=math.inf)
 
 
 def _add_times(pose: LocatedPose, read: float, total: float) -> LocatedPose:

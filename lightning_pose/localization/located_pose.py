@@ -25,7 +25,7 @@ class LocatedPose:
     Attributes:
         position_m: (3,) float64, the camera's centre in the scene's unit.
         quat_wxyz: (4,) float64, unit, camera-to-world.
-        status: `accepted`, or `refused`. Systems without a map accept every image that can be read.
+        status: `accepted`, or `refused`. Systems without a map refuse blank images alone.
         reason: why it is refused; empty if it is accepted.
         source: what the pose comes from: the landmark `map`, the `network`, or the `nearest` training frame;
             `none` if the image cannot be read.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -18,9 +19,10 @@ from lightning_pose.geometry.triangulation import (
 from lightning_pose.mapping.bundle_adjustment import Adjustment, CameraCorrection, adjust_bundle
 from lightning_pose.mapping.depth_vote import vote_depths
 from lightning_pose.mapping.frames import MapFrames
-from lightning_pose.mapping.guided_matching import KeypointMatches, match_pairs
+from lightning_pose.mapping.guided_matching import match_pairs
 from lightning_pose.mapping.pairs import FEW_FRAMES, choose_pairs, estimate_depth
 from lightning_pose.mapping.point_map import PointMap, quantize_descriptors
+from lightning_pose.mapping.threads import map_in_threads
 from lightning_pose.mapping.tracks import join_tracks
 
 __all__ = [
@@ -49,6 +51,9 @@ ADJUSTMENTS = 2
 
 HUBER_PX = 1.5
 """An observation counts in full up to this error."""
+
+PART = 2**14
+"""Observations whose tracks are refined at once: as many as fit a processor's cache."""
 
 GATES_PX = (12.0, 6.0, 3.0)
 """Observations farther than this from their point are left out, gate after gate."""
@@ -84,14 +89,12 @@ class MappedFrames:
         given: the frames with the poses that the dataset gives.
         seen: the same with the poses and keypoints of the map's own cameras.
         tracks: the map's points and their observations.
-        matches: those that the tracks are made of, and more.
         state: what bundle adjustment found, from which another goes on; None before the first.
     """
 
     given: MapFrames
     seen: MapFrames
     tracks: Tracks
-    matches: KeypointMatches
     state: Adjustment | None = None
 
     @property
@@ -113,27 +116,23 @@ def map_frames(frames: MapFrames, adjust: bool) -> MappedFrames:
         adjust: move poses, points and camera until they agree with the images, twice: poses that are better find
             more matches. Without it, the given poses are taken as they are.
     """
-    matches = match_frames(frames)
-    mapped = MappedFrames(frames, frames, triangulate_tracks(frames, find_tracks(frames, matches)), matches)
+    mapped = MappedFrames(frames, frames, triangulate_tracks(frames, find_tracks(frames)))
     return adjust_mapped(mapped) if adjust else mapped
 
 
 def adjust_mapped(mapped: MappedFrames) -> MappedFrames:
     """The same frames after bundle adjustment, twice, with new tracks between."""
-    given, seen, tracks, matches = mapped.given, mapped.seen, mapped.tracks, mapped.matches
+    given, seen, tracks = mapped.given, mapped.seen, mapped.tracks
     state = Adjustment(given.rotation, given.position, tracks.points)
     for again in range(ADJUSTMENTS):
         if again:
-            matches = match_frames(seen)
-            tracks = triangulate_tracks(seen, find_tracks(seen, matches))
+            tracks = triangulate_tracks(seen, find_tracks(seen))
         state, seen, tracks = _adjust_once(state, given, tracks)
-    return MappedFrames(given, seen, triangulate_tracks(seen, tracks), matches, state)
+    return MappedFrames(given, seen, triangulate_tracks(seen, tracks), state)
 
 
 def add_frames(mapped: MappedFrames, given: MapFrames, rows: np.ndarray, others: Sequence[CameraPose]) -> MappedFrames:
     """A map of more frames, whose old ones start where bundle adjustment has moved them: one round instead of two.
-
-    Matches between old frames are kept.
 
     Args:
         mapped: after bundle adjustment.
@@ -155,10 +154,9 @@ def add_frames(mapped: MappedFrames, given: MapFrames, rows: np.ndarray, others:
         position[row] = pose.position - rotation[row] @ old.offset_position
     start = replace(old, rotation=rotation, position=position)
     seen = _move_frames(start, given)
-    matches = replace(mapped.matches, frame=rows[mapped.matches.frame]).join(match_frames(seen, new))
-    tracks = triangulate_tracks(seen, find_tracks(seen, matches))
+    tracks = triangulate_tracks(seen, find_tracks(seen))
     state, seen, tracks = _adjust_once(start, given, tracks)
-    return MappedFrames(given, seen, triangulate_tracks(seen, tracks), matches, state)
+    return MappedFrames(given, seen, triangulate_tracks(seen, tracks), state)
 
 
 def _adjust_once(state: Adjustment, given: MapFrames, tracks: Tracks) -> tuple[Adjustment, MapFrames, Tracks]:
@@ -173,13 +171,9 @@ def _move_frames(state: Adjustment, given: MapFrames) -> MapFrames:
     return replace(given.with_poses(*state.camera_poses), points=points)
 
 
-def match_frames(frames: MapFrames, of: np.ndarray | None = None) -> KeypointMatches:
-    """Matches of frames with their partners: of all frames, or of those of these numbers."""
-    return match_pairs(frames, choose_pairs(frames, estimate_depth(frames.rotation, frames.position), of))
-
-
-def find_tracks(frames: MapFrames, matches: KeypointMatches) -> Tracks:
+def find_tracks(frames: MapFrames) -> Tracks:
     """Tracks of keypoints, at the least squares point of their rays."""
+    matches = match_pairs(frames, choose_pairs(frames, estimate_depth(frames.rotation, frames.position)))
     matches = matches.select(vote_depths(frames, matches))
     track, frame, keypoint = join_tracks(matches, frames.points.shape[1], count_observations(frames))
     n_tracks = int(track[-1]) + 1 if len(track) else 0
@@ -192,7 +186,7 @@ def triangulate_tracks(frames: MapFrames, tracks: Tracks, gates_px: Sequence[flo
     for gate_px in gates_px:
         frame, observed = tracks.frame, frames.points[tracks.frame, tracks.keypoint]
         centre, rotation, focal_px = frames.position[frame], frames.rotation[frame], frames.focal_px[frame]
-        points = refine_points(tracks.points, tracks.track, centre, rotation, observed, HUBER_PX / focal_px)
+        points = _refine_in_parts(tracks, (centre, rotation, observed, HUBER_PX / focal_px))
         error = np.linalg.norm(reprojection_errors(points[tracks.track], centre, rotation, observed), axis=1)
         near = error * focal_px <= gate_px
         count = np.bincount(tracks.track[near], minlength=len(points))
@@ -201,6 +195,18 @@ def triangulate_tracks(frames: MapFrames, tracks: Tracks, gates_px: Sequence[flo
     rays = find_rays(frames, tracks.frame, tracks.keypoint)
     wide = widest_angles_deg(tracks.track, rays, len(tracks.points)) >= MIN_ANGLE_DEG
     return tracks.select(wide[tracks.track])
+
+
+def _refine_in_parts(tracks: Tracks, columns: tuple[np.ndarray, ...]) -> np.ndarray:
+    """`refine_points` of some tracks at a time; `columns` are what it takes of each observation."""
+    starts = np.unique(tracks.track[::PART])
+
+    def refine(first: int, last: int) -> np.ndarray:
+        rows = slice(*np.searchsorted(tracks.track, [first, last]))
+        return refine_points(tracks.points[first:last], tracks.track[rows] - first, *(each[rows] for each in columns))
+
+    parts = map_in_threads(lambda ends: refine(*ends), pairwise([*starts.tolist(), len(tracks.points)]))
+    return np.concatenate([tracks.points[:0], *parts])
 
 
 def summarize_tracks(mapped: MappedFrames) -> PointMap:

@@ -57,11 +57,6 @@ class KeypointMatches:
         """The matches under a mask or of these numbers."""
         return KeypointMatches(self.frame[kept], self.keypoint[kept], self.distance[kept])
 
-    def join(self, other: KeypointMatches) -> KeypointMatches:
-        """These matches, and then the other ones."""
-        both = ((self.frame, other.frame), (self.keypoint, other.keypoint), (self.distance, other.distance))
-        return KeypointMatches(*(np.concatenate(columns) for columns in both))
-
 
 def match_pairs(frames: MapFrames, pairs: np.ndarray, band_px: float = BAND_PX) -> KeypointMatches:
     """Mutual nearest keypoints of each pair, among those near each other's epipolar lines.

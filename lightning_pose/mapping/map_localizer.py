@@ -173,7 +173,7 @@ class MapLocalizer:
             return self._refuse(frame, f"weak geometry: no pose agrees with four of {len(rows)} matches")
         pose, mask = found
         sigma = SIGMA_PX / query.focal_px
-        pose = refine_pose(pose, self.map.points[matched[mask]], points[rows[mask]], 2 * sigma).pose
+        pose = refine_pose(pose, self.map.points[matched[mask]], points[rows[mask]], 2 * sigma, steps=3).pose
         rows, matched, seen = self._matcher.match_guided(query, points, pose)
         visible = len(seen)
         if len(rows) < MIN_MATCHES:

@@ -48,13 +48,12 @@ def estimate_depth(rotation: np.ndarray, position: np.ndarray) -> float:
     return max(depth, extent * 1e-3, np.finfo(float).tiny)
 
 
-def choose_pairs(frames: MapFrames, depth: float, of: np.ndarray | None = None) -> np.ndarray:
+def choose_pairs(frames: MapFrames, depth: float) -> np.ndarray:
     """Pairs of frames to match.
 
     Args:
         frames: with poses.
         depth: nominal distance of what the frames see.
-        of: numbers of the frames that get partners; all if None.
 
     Returns:
         (P, 2) int64, first frame below the second, in ascending order.
@@ -64,8 +63,8 @@ def choose_pairs(frames: MapFrames, depth: float, of: np.ndarray | None = None) 
     baseline = np.linalg.norm(frames.position[:, None] - frames.position[None], axis=2)
     candidate = (np.minimum(seen, seen.T) >= MIN_OVERLAP) & (baseline >= MIN_BASELINE * depth)
     pairs: set[tuple[int, int]] = set()
-    for i in range(len(frames)) if of is None else of.tolist():
-        others = np.flatnonzero(candidate[i])
+    for i, row in enumerate(candidate):
+        others = np.flatnonzero(row)
         others = others[np.argsort(baseline[i, others], kind="stable")]
         chosen = np.unique(np.linspace(0, len(others) - 1, partners).round().astype(int)) if len(others) else []
         pairs.update((min(i, j), max(i, j)) for j in others[chosen].tolist())

@@ -1,4 +1,4 @@
-"""Work that several threads share, with the same result for any number of them."""
+"""Work that several threads share, with the same result for any number of them; torch only where it is there."""
 
 from __future__ import annotations
 

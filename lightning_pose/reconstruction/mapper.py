@@ -60,13 +60,50 @@ def _map_globally(database: Path, out: Path, threads: int, fixed: bool) -> None:
 
     if not fixed:
         calibration = pycolmap.ViewGraphCalibrationOptions()
-        calibration.random_seed = SEED
+        calibration.random_seed, calibration.reestimate_relative_pose = SEED, False
         pycolmap.calibrate_view_graph(database, calibration)
+    _calibrate_pairs(database, threads)
     options = pycolmap.GlobalPipelineOptions()
     options.num_threads, options.random_seed = threads, SEED
     options.mapper.bundle_adjustment.refine_focal_length = not fixed
     options.mapper.bundle_adjustment.refine_extra_params = not fixed
     pycolmap.global_mapping(database, out, out, options)
+
+
+def _calibrate_pairs(database: Path, threads: int) -> None:
+    """Find the essential matrix of each pair, now that focal lengths are known.
+
+    COLMAP calls half the pairs of a hand-held video planar or panoramic, because a homography explains most of their
+    matches as well, and its global mapper leaves these out: a walk falls into pieces. The rotations of their essential
+    matrices are sound; translations are not used, because the mapper places cameras by points.
+    """
+    from concurrent.futures import ThreadPoolExecutor
+
+    import numpy as np
+    import pycolmap
+
+    options = pycolmap.TwoViewGeometryOptions()
+    options.max_H_inlier_ratio, options.min_E_F_inlier_ratio = 1.0, 0.8
+    options.detect_watermark, options.compute_relative_pose = False, True
+    options.ransac.random_seed = SEED
+    with pycolmap.Database.open(database) as opened:
+        cameras = {camera.camera_id: camera for camera in opened.read_all_cameras()}
+        images = {image.image_id: image for image in opened.read_all_images()}
+        points = {number: opened.read_keypoints(number)[:, :2].astype(np.float64) for number in images}
+        pairs = [
+            (*pycolmap.pair_id_to_image_pair(number), geometry.inlier_matches)
+            for number, geometry in zip(*opened.read_two_view_geometries(), strict=True)
+            if len(geometry.inlier_matches)
+        ]
+
+        def calibrate(pair: tuple) -> pycolmap.TwoViewGeometry:
+            a, b, matches = pair
+            ends = (cameras[images[a].camera_id], points[a], cameras[images[b].camera_id], points[b])
+            return pycolmap.estimate_calibrated_two_view_geometry(*ends, matches, options)
+
+        with ThreadPoolExecutor(threads) as pool, pycolmap.DatabaseTransaction(opened):
+            for (a, b, _), geometry in zip(pairs, pool.map(calibrate, pairs), strict=True):
+                opened.update_two_view_geometry(a, b, geometry)
 
 
 def _map_incrementally(database: Path, out: Path, threads: int, fixed: bool, model: Path | None) -> None:

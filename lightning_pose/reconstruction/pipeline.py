@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -79,33 +80,17 @@ def reconstruct(
     Raises:
         DataError: there are too few frames, or no scene comes out of them; the message has the reasons.
     """
-    threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     names = choose_and_write(source, workspace, every, wanted, progress)
     paths = [workspace.images / name for name in names]
-    with open_database(workspace.database) as database, threadpool_limits(1):
-        database.add_images(names, *list_cameras(paths, camera))
-        extract_all(database, paths, threads, progress)
-        with progress.wait("finding frames that look alike"):
-            descriptors = [database.read_features(row)[1] for row in range(len(names))]
-            counts = np.array([len(each) for each in descriptors])
-            vectors = describe_frames(descriptors)
-            del descriptors
-        match_all(database, choose_pairs(vectors), threads, "matching pairs", progress)
-    fixed = camera is not None
-    model = find_poses(workspace, len(names), threads, fixed, progress)
-    if model is not None and model.num_reg_images() < len(names):
-        left = set(range(len(names))) - set(_list_posed(model))
-        with open_database(workspace.database) as database, threadpool_limits(1):
-            again = [pair for pair in choose_pairs(vectors, SECOND_ALIKE) if set(pair) & left]
-            match_all(database, again, threads, "matching frames without a pose", progress)
-        model = add_frames(workspace, model, threads, fixed, progress)
+    model = workspace.read_model() or _find_model(paths, workspace, camera, progress)
     with open_database(workspace.database) as database:
+        counts = np.array([database.count_keypoints(row) for row in range(len(names))])
         facts = [PairFacts(a, b, len(rows), kind) for a, b, rows, kind in database.list_pairs()]
-    posed = _list_posed(model)
+    posed = () if model is None else tuple(sorted(number - 1 for number in model.reg_image_ids()))
     reasons = diagnose(names, counts, facts, posed)
     if model is None or len(posed) < MIN_POSED:
         raise DataError(f"no poses were found for the {len(names)} frames of {source.path}: {'; '.join(reasons)}")
-    return PosedFrames(tuple(names), model, tuple(posed), tuple(reasons))
+    return PosedFrames(tuple(names), model, posed, tuple(reasons))
 
 
 def choose_and_write(
@@ -121,12 +106,14 @@ def choose_and_write(
     if kept is None:
         measures = measure_frames(progress.track(source.read_gray(), "choosing frames", source.count or None))
         count = len(measures.motion)
-        every_name = source.list_names(count)
-        rows = {find_frame(name, every_name) for name in wanted} - {None}
         every = 1 if every is None and not source.is_video and count <= FEW_PHOTOS else every
-        chosen = sorted({*choose_frames(measures, every).tolist(), *rows})
-        kept = {"chosen": chosen, "count": count}
-        workspace.keep("frames", kept)
+        kept = {"chosen": choose_frames(measures, every).tolist(), "count": count}
+    every_name = source.list_names(kept["count"])
+    rows = {row for name in wanted if (row := find_frame(name, every_name)) is not None}
+    if not rows <= set(kept["chosen"]):
+        workspace.clear_results()  # of fewer frames
+        kept["chosen"] = sorted(rows.union(kept["chosen"]))
+    workspace.keep("frames", kept)
     chosen = kept["chosen"]
     print(f"{len(chosen)} of {kept['count']} frames of {source.path} are used", flush=True)
     if len(chosen) < MIN_POSED:
@@ -136,6 +123,28 @@ def choose_and_write(
     return list(progress.track(source.write(chosen, workspace.images), "writing frames", len(chosen)))
 
 
-def _list_posed(model: pycolmap.Reconstruction | None) -> list[int]:
-    """Rows of the frames with a pose; none without a model."""
-    return [] if model is None else sorted(number - 1 for number in model.reg_image_ids())
+def _find_model(
+    paths: Sequence[Path], workspace: Workspace, camera: Camera | None, progress: StepProgress
+) -> pycolmap.Reconstruction | None:
+    """Match the images and find their poses; the model is kept. None if there is none."""
+    threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    fixed = camera is not None
+    with open_database(workspace.database) as database, threadpool_limits(1):
+        database.add_images(
+            [path.relative_to(workspace.images).as_posix() for path in paths], *list_cameras(paths, camera)
+        )
+        extract_all(database, paths, threads, progress)
+        with progress.wait("finding frames that look alike"):
+            vectors = describe_frames([database.read_features(row)[1] for row in range(len(paths))])
+        match_all(database, choose_pairs(vectors), threads, "matching pairs", progress)
+    model = find_poses(workspace, len(paths), threads, fixed, progress)
+    if model is None:
+        return None
+    left = set(range(len(paths))) - {number - 1 for number in model.reg_image_ids()}
+    if left:
+        with open_database(workspace.database) as database, threadpool_limits(1):
+            again = [pair for pair in choose_pairs(vectors, SECOND_ALIKE) if set(pair) & left]
+            match_all(database, again, threads, "matching frames without a pose", progress)
+        model = add_frames(workspace, model, threads, fixed, progress)
+    workspace.keep_model(model)
+    return model

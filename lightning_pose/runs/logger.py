@@ -16,11 +16,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cv2
+import numpy as np
 from lightning.fabric.utilities.rank_zero import rank_zero_only
 from lightning.pytorch.loggers import MLFlowLogger
 
 from lightning_pose.checkpoint import find_class_paths, read_checkpoint
-from lightning_pose.errors import CheckpointError, ConfigError
+from lightning_pose.errors import CheckpointError, ConfigError, ImageError
 from lightning_pose.paths import STORE_VARIABLE, default_tracking_uri
 from lightning_pose.runs.client import BufferedClient, is_unreachable
 from lightning_pose.runs.process import has_owner_died, process_tags
@@ -284,7 +285,7 @@ def _list_folders(value: object) -> list[Path]:
     return [Path(str(name)).expanduser().resolve() for name in names]
 
 
-def log_localizer(logger: MLflowLogger, checkpoint: Path, example: Path | None = None) -> None:
+def log_localizer(logger: MLflowLogger, checkpoint: Path, example: Path) -> None:
     """Log a localizer to the run as `model`, for `mlflow.pyfunc.load_model` and `mlflow models serve`.
 
     Args:
@@ -303,18 +304,22 @@ def log_localizer(logger: MLflowLogger, checkpoint: Path, example: Path | None =
 
 
 def _encode_jpeg(image: Path) -> bytes:
-    """The pixels of an image file as JPEG, which is smaller than most."""
-    return cv2.imencode(".jpg", cv2.cvtColor(read_rgb(image), cv2.COLOR_RGB2BGR))[1].tobytes()
+    """An image file as JPEG, which is smaller than most; black where it is gone and only features are left."""
+    try:
+        pixels = read_rgb(image)
+    except ImageError:
+        pixels = np.zeros((48, 64, 3), np.uint8)
+    return cv2.imencode(".jpg", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR))[1].tobytes()
 
 
-def _log_model(logger: MLflowLogger, checkpoint: Path, allow: list[str], example: Path | None) -> None:
+def _log_model(logger: MLflowLogger, checkpoint: Path, allow: list[str], example: Path) -> None:
     """Log the model, as MLflow does it for a run that is active in this process."""
     import mlflow
     import pandas as pd
 
     from lightning_pose.localization.mlflow_signature import SIGNATURE
 
-    shown = {} if example is None else {"input_example": pd.DataFrame({"image": [_encode_jpeg(example)]})}
+    shown = pd.DataFrame({"image": [_encode_jpeg(example)]})
     with _keep_environment(), warnings.catch_warnings():
         # MLflow warns of columns of whole numbers that may be missing; these are only in the answer.
         warnings.simplefilter("ignore", UserWarning)
@@ -325,7 +330,7 @@ def _log_model(logger: MLflowLogger, checkpoint: Path, allow: list[str], example
                 python_model=str(PACKAGE / "localization" / "mlflow_model.py"),
                 artifacts={"checkpoint": str(checkpoint)},
                 signature=SIGNATURE,
-                **shown,
+                input_example=shown,
                 model_config={"allow": allow},
                 code_paths=[str(PACKAGE)],
                 pip_requirements=[f"{name}=={version(name)}" for name in REQUIREMENTS],

@@ -108,6 +108,16 @@ def test_a_video_is_lost_and_found_again(
     assert times == pytest.approx([0.0, 0.5], abs=1e-6)
 
 
+def test_a_video_that_cannot_be_read_is_refused(
+    mapped_room: MappedRoom, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "bad.mp4").write_bytes(b"no video")
+    localize(mapped_room.checkpoint, tmp_path / "bad.mp4", mapped_room.images[0], "--format", "csv", expected=1)
+    rows = list(csv.DictReader(io.StringIO(capsys.readouterr().out)))
+    assert [row["status"] for row in rows] == ["refused", "accepted"]
+    assert "bad.mp4 cannot be opened as a video" in rows[0]["reason"]
+
+
 def test_images_as_one_sequence(folder: Path, mapped_room: MappedRoom, capsys: pytest.CaptureFixture[str]) -> None:
     (folder / "shot10.png").unlink()
     (folder / "shot10.png").write_bytes(b"damaged")

@@ -74,7 +74,7 @@ def test_a_second_call_goes_on_and_finds_the_same(out: Path, photos: Path, capsy
     assert main(["reconstruct", str(photos), str(out), "--align", str(photos.parent / "known.csv")]) == 0
     assert f"going on with what {out / 'reconstruction'} has" in capsys.readouterr().out
     steps = set(json.loads((out / "reconstruction.json").read_text())["seconds"])
-    assert not {"finding keypoints", "matching pairs"} & steps
+    assert not {"finding keypoints", "matching pairs", "finding poses (incremental mapper)"} & steps
     again = load_scene(out, val_fraction=0, test_fraction=0)
     for one, other in zip(first.frames, again.frames, strict=True):
         np.testing.assert_allclose(one.position_m, other.position_m, atol=1e-6)
@@ -134,3 +134,14 @@ def test_without_pycolmap_the_remedy_is_named(
 ) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     assert 'pip install "lightning-camera-localization[reconstruct]"' in refuse(capsys, photos, tmp_path / "out")
+
+
+def test_a_distance_can_be_given_later(
+    out: Path, photos: Path, truth: dict[str, Frame], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["reconstruct", str(photos), str(out), "--scale", "0 9.png 1"]) == 0
+    assert "going on" in capsys.readouterr().out
+    scene = load_scene(out, val_fraction=0, test_fraction=0)
+    position = {frame.image.name: frame.position_m for frame in scene.frames}
+    assert np.linalg.norm(position["0.png"] - position["9.png"]) == pytest.approx(1)
+    assert scene.unit == "m"

@@ -87,7 +87,7 @@ class Landscapes(TrainedSystem):
 def test_a_network_gets_the_nearer_of_both(
     size: tuple[int, int], knows_radius: bool, turned: bool, tmp_path: Path
 ) -> None:
-    stored = np.zeros((size[1], size[0], 3), np.uint8)
+    stored = np.random.default_rng(0).integers(0, 255, (size[1], size[0], 3)).astype(np.uint8)
     pose = Localizer(Landscapes(knows_radius)).localize(save_photo(tmp_path / "a.png", stored, 6))
     if turned:
         np.testing.assert_allclose(pose.quat_wxyz, [0.5**0.5, 0, 0, 0.5**0.5])

@@ -125,6 +125,14 @@ def test_one_image_may_stand_alone(localizer: Localizer, images: list[Path]) -> 
         localizer.localize("a.png")
 
 
+def test_a_blank_image_is_refused(localizer: Localizer) -> None:
+    rng = np.random.default_rng(0)
+    dark = localizer.localize(rng.integers(0, 4, (48, 64)).astype(np.uint8))
+    assert (dark.status, dark.reason, dark.source) == ("refused", "the image is blank", "network")
+    assert np.isinf(dark.radius_m)
+    assert localizer.localize(rng.integers(0, 255, (48, 64)).astype(np.uint8)).accepted
+
+
 def test_no_image_has_no_pose(localizer: Localizer) -> None:
     assert localizer.localize([]) == []
 

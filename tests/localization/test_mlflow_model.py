@@ -86,13 +86,13 @@ def test_what_cannot_be_used_names_its_row(model: PyFuncModel, table: dict[str, 
 def test_the_docs_load_it_in_a_copied_project(
     trained: Trained, images: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The lines of docs/usage.md, in a folder for which MLflow has other places of artifacts."""
+    """The lines of docs/tracking.md, in a folder for which MLflow has other places of artifacts."""
     run = trained.run.info.run_id
     shutil.copytree(trained.workplace.folder, tmp_path / "copy")
     monkeypatch.chdir(tmp_path / "copy")
     # MLflow keeps an open store by its address, and a relative one is that of another test's folder
     monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path}/copy/mlruns/mlflow.db")
-    page = (REPOSITORY / "docs" / "usage.md").read_text()
+    page = (REPOSITORY / "docs" / "tracking.md").read_text()
     code = page.split("```python\n")[1].split("```")[0].replace("RUN_ID", run).replace("image.jpg", str(images[0]))
     names: dict[str, pd.DataFrame] = {}
     exec(code, names)

@@ -22,6 +22,8 @@ def test_a_wrong_pose_and_a_missing_one_explain_nothing_of_their_frame(tmp_path:
     others = sum(len(rows) for a, b, rows in pairs if 1 not in (a, b))
     frame = model.image(1).frame
     turn = pycolmap.Rigid3d(pycolmap.Rotation3d([0.0, 0.0, 0.5]), [0.5, 0.0, 0.0])
+    assert frame is not None
+    assert frame.rig_from_world is not None
     frame.rig_from_world = turn * frame.rig_from_world
     assert others <= count_agreeing(model, pairs) < others + 0.2 * (sum(len(rows) for *_, rows in pairs) - others)
     model.deregister_frame(frame.frame_id)

@@ -38,6 +38,18 @@ MAP_SHAPES = {
 }
 """Shape and type of each array of an empty `PointMap`; the descriptor's width is added."""
 
+STORED = {
+    "points": torch.float32,
+    "log_size": torch.float16,
+    "direction": torch.float16,
+    "seen_point": torch.uint16,
+    "rotation": torch.float32,
+    "position": torch.float32,
+    "given_rotation": torch.float32,
+    "given_position": torch.float32,
+}
+"""Types in which checkpoints hold arrays, if that loses nothing: half the bytes. Real numbers are rounded to them."""
+
 CAMERA_NUMBERS = 15
 
 RESIZED = ("camera_numbers", *(name for name in MAP_SHAPES if name != "camera"))
@@ -94,6 +106,7 @@ class MapNetwork(nn.Module):
         self.register_buffer("camera_numbers", torch.zeros(CAMERA_NUMBERS, dtype=torch.float64))
         self.register_buffer("calibration", torch.full((2,), torch.nan, dtype=torch.float64))
         self._localizer: MapLocalizer | None = None
+        self.register_state_dict_post_hook(_store_small)
         self.register_load_state_dict_post_hook(lambda module, _: module.forget_localizer())
 
     def forget_localizer(self) -> None:
@@ -104,8 +117,9 @@ class MapNetwork(nn.Module):
         """Take a map, the camera of queries that come without one, and the factors of its radii."""
         device = self.calibration.device
         for field in fields(point_map):
-            kind = MAP_SHAPES[field.name][1]
-            getattr(self, field.name).data = torch.from_numpy(getattr(point_map, field.name)).to(device, kind)
+            kind, values = MAP_SHAPES[field.name][1], torch.from_numpy(getattr(point_map, field.name))
+            rounded = values.to(STORED.get(field.name, kind)) if values.is_floating_point() else values
+            getattr(self, field.name).data = rounded.to(device, kind)
         lens = -len(camera.distortion) if camera.lens else int(camera.fisheye)
         numbers = [camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, lens]
         numbers += [*camera.distortion, *[0.0] * (8 - len(camera.distortion))]
@@ -174,3 +188,12 @@ class MapNetwork(nn.Module):
                 for answer in self.locate(features, cameras)
             ]
         return torch.tensor(np.array(pose).reshape(-1, 7), dtype=features.dtype, device=features.device)
+
+
+def _store_small(module: nn.Module, state_dict: dict[str, Tensor], prefix: str, *_: object) -> None:
+    """Give a state dict the types of `STORED`, where they hold all values; loading turns them back."""
+    for name, kind in STORED.items():
+        values = state_dict[prefix + name]
+        small = values.to(kind)
+        if torch.equal(small.to(values.dtype), values):
+            state_dict[prefix + name] = small
