@@ -137,7 +137,7 @@ class _Collector:
         """The file."""
         parts = [f'"""{head}"""', "from __future__ import annotations", self._write_imports()]
         owner: dict[str, str] = {}
-        for name in self.order:
+        for name in self._sort():
             module = self.modules[name]
             parts.append(_write_headline(module))
             for number in sorted(module.needed):
@@ -148,6 +148,26 @@ class _Collector:
         text = "\n\n".join([*parts, tail])
         text = re.sub(r"\n\n(?=(?:@|class |def |# -----))", "\n\n\n", SHAPED.sub("np.ndarray", text)) + "\n"
         return text.replace(CONTENTS, _list_contents(text))
+
+    def _sort(self) -> list[str]:
+        """The modules, each after those whose definitions it uses."""
+        done: list[str] = []
+        seen: set[str] = set()
+
+        def visit(name: str) -> None:
+            seen.add(name)
+            module = self.modules[name]
+            for used in sorted({used for number in module.needed for used in module.statements[number].used}):
+                source, original = module.imported.get(used, ("", None))
+                source = self.replaced.get(f"{source}.{original}", f"{source}.{original}").rpartition(".")[0]
+                if source in self.order and source not in seen:
+                    visit(source)
+            done.append(name)
+
+        for name in self.order:
+            if name not in seen:
+                visit(name)
+        return done
 
     def _write_imports(self) -> str:
         lines, joined = [], {}
