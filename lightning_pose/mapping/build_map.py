@@ -224,7 +224,8 @@ def _refine_in_parts(tracks: Tracks, columns: tuple[np.ndarray, ...]) -> np.ndar
 
     def refine(first: int, last: int) -> np.ndarray:
         rows = slice(*np.searchsorted(tracks.track, [first, last]))
-        return refine_points(tracks.points[first:last], tracks.track[rows] - first, *(each[rows] for each in columns))
+        centre, rotation, observed, huber = (each[rows] for each in columns)
+        return refine_points(tracks.points[first:last], tracks.track[rows] - first, centre, rotation, observed, huber)
 
     parts = map_in_threads(lambda ends: refine(*ends), pairwise([*starts.tolist(), len(tracks.points)]))
     return np.concatenate([tracks.points[:0], *parts])
