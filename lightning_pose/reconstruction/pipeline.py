@@ -108,7 +108,8 @@ def choose_and_write(
         count = len(measures.motion)
         every = 1 if every is None and not source.is_video and count <= FEW_PHOTOS else every
         kept = {"chosen": choose_frames(measures, every).tolist(), "count": count}
-    rows = {find_frame(name, source.list_names(kept["count"])) for name in wanted} - {None}
+    names = source.list_names(kept["count"])
+    rows = {row for row in (find_frame(name, names) for name in wanted) if row is not None}
     if not rows <= set(kept["chosen"]):
         workspace.clear_results()  # of fewer frames
         kept["chosen"] = sorted(rows.union(kept["chosen"]))

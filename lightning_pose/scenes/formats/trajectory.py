@@ -131,7 +131,7 @@ def _pair_images(path: Path, images: Sequence[Path], times: np.ndarray) -> list[
         log.warning(
             "%s: dropped %d of %d images, no pose within 20 ms of the time in their name", path, missed, len(own)
         )
-    return [_Pair(images[listed[i]], int(row), float(own[listed[i]])) for i, row in paired]
+    return [_Pair(images[int(listed[i])], int(row), float(own[listed[i]])) for i, row in paired]
 
 
 def _read_names(path: Path) -> list[tuple[int, str]]:
