@@ -70,7 +70,6 @@ CASES: dict[str, Callable[[ImageDataModule], None]] = {
     "second half, tested on the first": test_on_half(0),
 }
 BLURS = (2, 4, 8)
-"""Sigma in pixels of test frames, for the system that learnt from all training frames."""
 
 
 def fit_refined(root: str, truth: str, pgt: str | None, case: str) -> tuple[KernelPoseNet, ImageDataModule]:
@@ -142,6 +141,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add_scene_arguments(parser)
     parser.add_argument("--only", nargs="+", choices=list(CASES), default=list(CASES))
+    about = "pixels by which test frames are blurred, for the system that learnt from all training frames"
+    parser.add_argument("--blurs", nargs="*", type=float, default=BLURS, metavar="SIGMA", help=about)
     args = parser.parse_args()
     rows: list[Row] = []
     details: list[Row] = []
@@ -150,8 +151,8 @@ def main() -> None:
             model, data = fit_refined(args.root, truth, args.pgt, case)
             changes: dict[str, Change | None] = {case: None}
             if case == "all training frames":
-                for sigma in BLURS:
-                    changes[f"test frames blurred, {sigma} px"] = lambda x, s=sigma: cv2.GaussianBlur(x, (0, 0), s)
+                for sigma in args.blurs:
+                    changes[f"test frames blurred, {sigma:g} px"] = lambda x, s=sigma: cv2.GaussianBlur(x, (0, 0), s)
             for name, change in changes.items():
                 row, more = ask(model, data, name, truth, change)
                 rows.append(row)

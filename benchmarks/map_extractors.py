@@ -47,7 +47,11 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", default=DEFAULT, metavar="NAME:COUNT", help=f"of {', '.join(EXTRACTORS)}")
     args = parser.parse_args()
     truths = find_truths(args)
-    rows = [measure_extractor(name, args.root, truth, args.pgt) for name in args.only for truth in truths]
+    rows = []
+    for name in args.only:
+        for truth in truths:
+            rows.append(measure_extractor(name, args.root, truth, args.pgt))
+            print("...", *rows[-1], flush=True)
     head = [
         "keypoints", "ground truth", "m / deg", "5 cm", "accepted", "adjustment", "points", "checkpoint MB", "fit s",
     ]  # fmt: skip

@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import io
+import itertools
 from pathlib import Path
 
 import cv2
@@ -30,10 +31,16 @@ from map_trials import (
 from scipy.spatial.transform import Rotation
 from scipy.stats import spearmanr
 
+from lightning_pose.geometry.absolute_pose import CameraPose
+from lightning_pose.mapping.map_localizer import MapAnswer
+from lightning_pose.mapping.query_matching import QueryMatcher
 from lightning_pose.models.parts.frame_cameras import list_cameras
 from lightning_pose.scenes.images import read_gray, read_rgb
 
 SAME_WAY_DEG = 30.0
+INLIERS = (0, 1, 6, 10, 15, 20, 30, 10**4)
+"""Bounds of the groups of frames by their inliers."""
+
 NEIGHBOURS = 10
 """Training frames around a test frame whose poses are compared with the SfM's."""
 
@@ -141,6 +148,29 @@ def compare_groups(fitted: FittedMap, frames: TestFrames) -> list[list[object]]:
     ]
 
 
+def compare_fallbacks(fitted: FittedMap, frames: TestFrames) -> list[list[object]]:
+    """By inliers: errors of the map's poses, and of the most similar training frame's, whose points match best."""
+    point_map = fitted.module.network.point_map
+    matcher = QueryMatcher(point_map)
+    similar = []
+    for features in fitted.data.dataset("test").data.features.numpy():
+        descriptors = features[(features != 0).any(1), :-4]
+        frame, _, _ = matcher.match_candidates(matcher.compare(descriptors))
+        pose = CameraPose(point_map.given_rotation[frame], point_map.given_position[frame])
+        similar.append(MapAnswer(pose, pose, 0, 0, ""))
+    errors, of_similar = frames.errors, fitted.measure(similar)
+    inliers = np.array([answer.inliers for answer in frames.answers])
+    rows: list[list[object]] = []
+    for low, high in itertools.pairwise(INLIERS):
+        mask = (inliers >= low) & (inliers < high)
+        if mask.any():
+            each = (errors.select(mask), of_similar.select(mask))
+            nearer = np.mean(each[0].position_m < each[1].position_m)
+            worst = f"{each[0].position_m.max():.2f}"
+            rows.append([f"{low} to {high - 1}", mask.sum(), each[0].medians, worst, each[1].medians, f"{nearer:.0%}"])
+    return rows
+
+
 def main() -> None:
     """Print tables for each ground truth, as Markdown, and write pictures to a folder."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -157,6 +187,8 @@ def main() -> None:
         print(f"{fitted.data.scene.name}, {truth} ground truth; refused: {list_reasons(frames.answers)}")
         head = ["frames", "count", "error m", "features", "inliers", "visible", "sharpness"]
         print_table([*head, "nearest m", "deg", "truth m"], compare_groups(fitted, frames))
+        head = ["inliers", "count", "map m / deg", "worst", "most similar frame m / deg", "map nearer"]
+        print_table(head, compare_fallbacks(fitted, frames))
         head = ["frame", "m / deg", "inliers", "", "sharpness", "nearest training frame", "truth m"]
         print_table(head, list_worst(fitted, frames, out, args.worst))
         if args.pgt and truth == "original":

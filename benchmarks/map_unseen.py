@@ -146,6 +146,7 @@ def main() -> None:
             answers = ask_changed(fitted, surf, change)
             errors = measure_upside_down(fitted, answers) if name == "upside down" else fitted.measure(answers)
             rows.append(make_row(name, answers, test, None if name in MUST_REFUSE else errors))
+            print("...", *rows[-1], flush=True)
         print(f"{fitted.data.scene.name}, {truth} ground truth, {args.n_features} features")
         head = ["images", "accepted", "m / deg", "false", "inliers: median, most", "AUROC", "of the share", "refused"]
         print_table(head, rows)

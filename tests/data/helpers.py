@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import struct
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,7 +10,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-__all__ = ["QUARTER_TURN_Z", "REAL_DATA", "make_image", "make_turned_jpeg", "write_seven_scenes"]
+from lightning_pose.scenes.trajectory_files import write_tum
+
+__all__ = ["QUARTER_TURN_Z", "REAL_DATA", "make_image", "make_turned_jpeg", "write_recording", "write_seven_scenes"]
 
 REAL_DATA = Path(__file__).parents[3] / "shared" / "data"
 """Real datasets beside the checkout, for those who have them; tests that need them are skipped without."""
@@ -60,3 +63,20 @@ def write_seven_scenes(root: Path, train: Mapping[int, int], test: Mapping[int, 
                 T_world_cam[:3, 3] = i, number, 0
                 np.savetxt(stem.with_suffix(".pose.txt"), T_world_cam, fmt="%.7e")
     return root
+
+
+def write_recording(root: Path, source: Path, sequence: int) -> str:
+    """One sequence of a scene in 7-Scenes layout, as a folder in TUM layout."""
+    images = sorted((source / f"seq-{sequence:02d}").glob("*.png"))
+    (root / "rgb").mkdir(parents=True)
+    matrices = [np.loadtxt(str(image).replace("color.png", "pose.txt")) for image in images]
+    lines = []
+    for number, image in enumerate(images):
+        shutil.copy(image, root / "rgb" / f"{number}.png")
+        lines.append(f"{1000 + number / 10:.6f} rgb/{number}.png\n")
+    (root / "rgb.txt").write_text("".join(lines))
+    turns = [np.arctan2(T[0, 2], T[0, 0]) for T in matrices]
+    quats = np.array([[np.cos(turn / 2), 0, np.sin(turn / 2), 0] for turn in turns])
+    times = [1000 + number / 10 for number in range(len(images))]
+    write_tum(root / "groundtruth.txt", times, np.array([T[:3, 3] for T in matrices]), quats)
+    return str(root)

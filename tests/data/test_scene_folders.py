@@ -13,25 +13,8 @@ from lightning_pose.checkpoint import build_object
 from lightning_pose.data import ClipDataModule, ImageDataModule
 from lightning_pose.errors import ConfigError
 from lightning_pose.scenes.scene import Frame
-from lightning_pose.scenes.trajectory_files import write_tum
+from tests.data.helpers import write_recording
 from tests.helpers import Thumbnails, write_scene
-
-
-def write_recording(root: Path, source: Path, sequence: int) -> str:
-    """One sequence of a scene in 7-Scenes layout, as a folder in TUM layout."""
-    images = sorted((source / f"seq-{sequence:02d}").glob("*.png"))
-    (root / "rgb").mkdir(parents=True)
-    matrices = [np.loadtxt(str(image).replace("color.png", "pose.txt")) for image in images]
-    lines = []
-    for number, image in enumerate(images):
-        shutil.copy(image, root / "rgb" / f"{number}.png")
-        lines.append(f"{1000 + number / 10:.6f} rgb/{number}.png\n")
-    (root / "rgb.txt").write_text("".join(lines))
-    turns = [np.arctan2(T[0, 2], T[0, 0]) for T in matrices]
-    quats = np.array([[np.cos(turn / 2), 0, np.sin(turn / 2), 0] for turn in turns])
-    times = [1000 + number / 10 for number in range(len(images))]
-    write_tum(root / "groundtruth.txt", times, np.array([T[:3, 3] for T in matrices]), quats)
-    return str(root)
 
 
 @pytest.fixture(scope="module")
