@@ -1,16 +1,19 @@
-"""Time of SURF against OpenCV's SIFT: the same frames, one thread, interleaved rounds in one run.
+"""Time of SURF against OpenCV's SIFT: the same frames, interleaved rounds in one run, also beside busy programs.
 
-    python benchmarks/surf.py --images DIR [--n_features 300] [--rounds 5]
+    python benchmarks/surf.py --images DIR [--n_features 300] [--rounds 5] [--threads 1 2] [--busy 0 2]
 
 Both detect and describe the N strongest features. Without `--images` the frames are made: blurred noise
-of many scales, 640 x 480. The ratio is the median over frames and rounds of SURF's time over SIFT's.
+of many scales, 640 x 480. The ratio is the median over frames and rounds of SURF's time over SIFT's, which has one
+thread. `--threads` is what torch is allowed; `--busy` how many loops that never rest run at the same time.
 """
 
 from __future__ import annotations
 
 import argparse
+import multiprocessing
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from statistics import median
 
@@ -48,6 +51,40 @@ def milliseconds(work: Callable[[], object]) -> float:
     return (time.perf_counter() - start) * 1e3
 
 
+def spin() -> None:
+    """Take a core until the process is ended."""
+    while True:
+        pass
+
+
+@contextmanager
+def run_busy(count: int) -> Iterator[None]:
+    """Keep so many cores busy."""
+    loops = [multiprocessing.Process(target=spin, daemon=True) for _ in range(count)]
+    for loop in loops:
+        loop.start()
+    try:
+        yield
+    finally:
+        for loop in loops:
+            loop.terminate()
+            loop.join()
+
+
+def measure(frames: list[np.ndarray], n_features: int, rounds: int) -> tuple[float, float, float]:
+    """Median milliseconds of SIFT and of SURF, and the median ratio."""
+    sift, surf = cv2.SIFT.create(n_features), SURF(n_features)
+    tensors = [torch.from_numpy(frame)[None] for frame in frames]
+    surf(tensors[0])  # the first call builds tables
+    pairs = [
+        (milliseconds(lambda f=f: sift.detectAndCompute(f, None)), milliseconds(lambda t=t: surf(t)))
+        for _ in range(rounds)
+        for f, t in zip(frames, tensors, strict=True)
+    ]
+    sift_ms, surf_ms = (median(column) for column in zip(*pairs, strict=True))
+    return sift_ms, surf_ms, median(b / a for a, b in pairs)
+
+
 def main() -> None:
     """Print the median times per frame and their ratio."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -55,24 +92,21 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=20, help="how many of the images to use")
     parser.add_argument("--n_features", type=int, default=300)
     parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--busy", type=int, nargs="+", default=[0, 2])
     args = parser.parse_args()
 
-    torch.set_num_threads(1)
     cv2.setNumThreads(1)
     frames = read_frames(args.images, args.frames) if args.images else make_frames(args.frames)
-    sift, surf = cv2.SIFT.create(args.n_features), SURF(args.n_features)
-    tensors = [torch.from_numpy(frame)[None] for frame in frames]
-    surf(tensors[0])  # the first call builds tables
-    pairs = [
-        (milliseconds(lambda f=f: sift.detectAndCompute(f, None)), milliseconds(lambda t=t: surf(t)))
-        for _ in range(args.rounds)
-        for f, t in zip(frames, tensors, strict=True)
-    ]
-    sift_ms, surf_ms = (median(column) for column in zip(*pairs, strict=True))
     height, width = frames[0].shape
     print(f"{len(frames)} frames of {width} x {height}, {args.rounds} rounds, N = {args.n_features}")
-    print(f"SIFT {sift_ms:.1f} ms, SURF {surf_ms:.1f} ms a frame")
-    print(f"ratio {median(b / a for a, b in pairs):.3f}")
+    print("| busy loops | threads | SIFT ms | SURF ms | ratio |\n|---|---|---|---|---|")
+    for busy in args.busy:
+        with run_busy(busy):
+            for threads in args.threads:
+                torch.set_num_threads(threads)
+                sift_ms, surf_ms, ratio = measure(frames, args.n_features, args.rounds)
+                print(f"| {busy} | {threads} | {sift_ms:.1f} | {surf_ms:.1f} | {ratio:.3f} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -54,7 +54,7 @@ DPI = 110
 DEPTH_M = (0.3, 10.0)
 """Depths that the votes are drawn between."""
 
-QUALITY = 82
+QUALITY = 82  # of WebP
 
 
 @dataclass(frozen=True)
@@ -85,10 +85,9 @@ class Stage:
 
 def read_stage() -> Stage:
     """Extract keypoints of the room, choose pairs and match them."""
-    datamodule = ImageDataModule(extractor=SURF(300, with_geometry=True), root=room_folder(seed=0, frames=300))
+    datamodule = ImageDataModule(extractor=SURF(300, with_geometry=True), root=str(room_folder(seed=0, frames=300)))
     datamodule.prepare_data()
-    scene = datamodule.scene
-    camera = datamodule.find_camera(int(scene.splits["train"][0]))
+    camera = datamodule.find_camera(int(datamodule.scene.splits["train"][0]))
     assert camera is not None, "the room knows its camera"
     train, test = (_read_frames(datamodule, camera, split) for split in ("train", "test"))
     pairs = choose_pairs(train, estimate_depth(train.rotation, train.position))
@@ -220,8 +219,8 @@ def draw_from_above(stage: Stage, localizer: MapLocalizer, answers: Sequence[Map
     """The map's points, the training cameras, and where test frames are located."""
     found = np.array([answer.pose.position for answer in answers])
     accepted = np.array([answer.accepted for answer in answers])
-    title = "The map of the synthetic room, from above"
-    figure = draw_map(localizer.map.points, stage.train.position, stage.test.position, found, accepted, title)
+    cameras = stage.train.position, stage.test.position
+    figure = draw_map(localizer.map.points, *cameras, found, accepted, "The map of the synthetic room, from above")
     figure.set_size_inches(7.5, 6.2)
     return figure
 

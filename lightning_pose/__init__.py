@@ -6,12 +6,13 @@ These names are imported on first use, so that `import lightning_pose` does not 
 
 The data goes one way, and imports follow it:
 
-- `errors`, `paths`, `geometry`: exceptions, where files are kept, quaternions and poses
+- `errors`, `paths`, `threads`, `geometry`: exceptions, where files are kept, threads, quaternions and poses
 - `scenes`: a folder on disk -> `Scene`
 - `features`: images -> SURF and other descriptors, cached
 - `data`: Scene + features -> batches
 - `losses`, `metrics`, `models`: the architectures, one file each
 - `localization`: a checkpoint -> poses of images
+- `serving`: a localizer behind HTTP
 - `runs`, `figures`, `evaluation`: MLflow, and what every test ends with
 - `sweeps`, `studies`, `reports`: tuning, the thesis's figures, tables of finished runs
 - `cli`, `commands`: what users run
@@ -19,6 +20,7 @@ The data goes one way, and imports follow it:
 
 from __future__ import annotations
 
+import os
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
@@ -59,6 +61,12 @@ __all__ = [
 
 _MODULES = {"Localizer": "lightning_pose.localization.localizer", "load_scene": "lightning_pose.scenes.formats"}
 """Where the names that are no architectures are defined; the architectures come from `lightning_pose.models`."""
+
+if "OMP_WAIT_POLICY" not in os.environ:
+    # Threads of torch that have nothing to do spin for the next work, and take the core from the thread that should
+    # bring it: on two busy cores SURF took ten times as long. They sleep after this many rounds, some 0.05 ms.
+    # Read when torch is loaded; without effect where the program has done so before.
+    os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 
 try:
     __version__ = version("lightning-camera-localization")

@@ -18,6 +18,10 @@ VERBS = {
     "validate": ("lightning_pose.cli", "measure a checkpoint on the validation frames"),
     "test": ("lightning_pose.cli", "measure a checkpoint on the test frames, beside its baselines"),
     "predict": ("lightning_pose.cli", "write a checkpoint's poses of the test frames as TUM files"),
+    "localize": (
+        "lightning_pose.commands.localize",
+        "locate images, a folder, a video or a camera with a trained system",
+    ),
     "extract": ("lightning_pose.commands.extract", "fill the feature cache: parallel, resumable"),
     "sweep": ("lightning_pose.commands.sweep", "search a config's settings, on validation frames: parallel, resumable"),
     "report": (
@@ -25,11 +29,13 @@ VERBS = {
         "tables of finished runs: systems by scenes, beside baselines and published rows",
     ),
     "check": ("lightning_pose.commands.check", "say what a dataset holds, and what is wrong with it"),
+    "export": ("lightning_pose.commands.export", "write a folder that locates images with no torch installed"),
     "export-map": ("lightning_pose.commands.export_map", "write a landmark map as a COLMAP model and as PLY"),
     "reconstruct": (
         "lightning_pose.commands.reconstruct",
         "find the poses of a video's frames, or of images (pycolmap)",
     ),
+    "serve": ("lightning_pose.commands.serve", "answer images with poses over HTTP, with a page to try it"),
     "synth": ("lightning_pose.commands.synth", "render a synthetic room as a dataset"),
 }
 

@@ -12,6 +12,7 @@ import pytest
 
 if TYPE_CHECKING:  # they take seconds to import, and most tests do without
     from tests.helpers import Trained, Workplace
+    from tests.rooms import MappedRoom
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported: each test process has one core
 # Tests start processes: without compiled modules on disk each would compile all that it imports, for seconds.
@@ -71,3 +72,11 @@ def trained(tmp_path_factory: pytest.TempPathFactory, scene: Path, store: Path) 
     from tests.helpers import Trained, Workplace
 
     return Trained.make(Workplace.make(tmp_path_factory.mktemp("trained") / "workplace", scene, store))
+
+
+@pytest.fixture(scope="session")
+def mapped_room(tmp_path_factory: pytest.TempPathFactory) -> MappedRoom:
+    """A landmark map of a small room; not to be changed."""
+    from tests.rooms import MappedRoom
+
+    return MappedRoom.make(tmp_path_factory.mktemp("mapped"))

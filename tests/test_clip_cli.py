@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,7 @@ from lightning_pose.geometry.quaternions import orientation_error_deg, position_
 from lightning_pose.geometry.relative import absolute_poses
 from lightning_pose.localization.localizer import Localizer
 from lightning_pose.localization.located_pose import stack_poses
+from lightning_pose.localization.video import VideoTracker
 from tests.helpers import Trained, Workplace, write_scene
 
 
@@ -74,6 +77,19 @@ def test_the_localizer_chains_a_video(clip_run: Trained) -> None:
     placed = absolute_poses(position_m, quat_wxyz, truth[0, 1:4], truth[0, [7, 4, 5, 6]])
     torch.testing.assert_close(placed[0], kept[:, 1:4], atol=1e-4, rtol=0)
     assert orientation_error_deg(placed[1], kept[:, [7, 4, 5, 6]]).max() < 0.01
+
+
+def test_a_live_video_is_chained_frame_by_frame(clip_run: Trained) -> None:
+    """The verb takes images in order for one video; every frame has a pose when it comes."""
+    folder = clip_run.workplace.scene / "seq-03"
+    with contextlib.redirect_stdout(io.StringIO()) as stdout:
+        assert clip_run.workplace.command("localize", clip_run.best, folder, "--allow", "tests") == 0
+    rows = np.loadtxt(io.StringIO(stdout.getvalue()))
+    assert len(rows) == len(list(folder.glob("*.png")))
+    np.testing.assert_allclose(rows[0, 1:], [0, 0, 0, 0, 0, 0, 1])
+    tracker = VideoTracker(Localizer.load(clip_run.best, allow="tests"))
+    poses = [tracker.localize(image) for image in sorted(folder.glob("*.png"))]
+    np.testing.assert_allclose(rows[:, 1:4], stack_poses(poses)[0], atol=1e-8)
 
 
 def test_predict_writes_the_same(clip_run: Trained, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import ast
+import contextlib
 import re
 import shlex
-from collections.abc import Iterator
+import shutil
+from collections.abc import Callable, Iterator
+from importlib import import_module
 from inspect import signature
 from pathlib import Path
 from typing import NamedTuple
@@ -17,14 +21,13 @@ from lightning_pose.cli import PoseCLI
 from lightning_pose.commands.parser import VerbParser
 from lightning_pose.runs import logger
 from lightning_pose.scenes.synthetic import render_room
-from lightning_pose.studies import figure_spec
 from tests.data.helpers import write_recording
 from tests.helpers import REPOSITORY, Workplace
 
 PAGES = sorted([*REPOSITORY.glob("*.md"), *(REPOSITORY / "docs").glob("*.md")])
 PROGRAM = "python -m lightning_pose "
 SHELL = ("uv", "python", "mlflow", "bash", "docker", "curl", "pip")
-DATED = re.compile(r"\b[Rr]un on 20\d\d-\d\d-\d\d")
+DATED = re.compile(r"\b[Rr]un on 20\d\d-\d\d-\d\d|has not been built yet")
 CHECKPOINT = REPOSITORY / "tests" / "checkpoints" / "surf_lstm_0_1.ckpt"
 SYSTEMS = ("linear_posenet", "surf_lstm", "cnn_rnn")
 
@@ -44,6 +47,8 @@ ELSEWHERE = {
     f"{PROGRAM}fit --config configs/cnn_rnn.yaml": "test_configs.py",
     f"{PROGRAM}fit --config configs/surf_lstm.yaml --data.root DIR --ckpt_path last": "test_cli.py",
     f"{PROGRAM}fit --config configs/surf_lstm.yaml --data.root DIR --trainer.devices 2": "runs/test_devices.py",
+    f"{PROGRAM}check dataset": "commands/test_check.py",
+    f"{PROGRAM}fit --config configs/landmark_map.yaml --data.root dataset": "test_configs.py",
     f"{PROGRAM}predict --ckpt_path FILE --allow my_package.MyNet": "test_trust.py",
     "mlflow ui --backend-store-uri sqlite:///mlruns/mlflow.db": "runs/test_mlflow_ui.py",
 }
@@ -81,6 +86,7 @@ def list_commands(page: Path) -> Iterator[Command]:
                         yield Command(f"{page.relative_to(REPOSITORY)}:{number}", text, section)
 
 
+PYTHON = [block for page in PAGES for block in re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)]
 COMMANDS = [command for page in PAGES for command in list_commands(page)]
 
 
@@ -88,28 +94,21 @@ class Parsed(BaseException):
     """The parser has accepted the command, which ends here."""
 
 
-@pytest.fixture
-def parse_only(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Commands end once their options are understood."""
-    of_verb, of_cli = VerbParser.parse_args, PoseCLI.parse_arguments
+def end_after(parse: Callable[..., object]) -> Callable[..., None]:
+    """A method that parses, and then raises `Parsed`."""
 
-    def parse_verb(parser: VerbParser, *args: object) -> object:
-        parsed = of_verb(parser, *args)  # type: ignore[call-overload]
-        if not parser.prog.endswith(" sweep"):  # which reads its config's settings afterwards
-            raise Parsed
-        return parsed
-
-    def parse_settings(cli: PoseCLI, *args: object) -> None:
-        of_cli(cli, *args)  # type: ignore[arg-type]
-        if type(cli) is PoseCLI:  # not the base config of a sweep
-            raise Parsed
-
-    def end(*args: object) -> None:
+    def parse_and_end(*args: object) -> None:
+        parse(*args)
         raise Parsed
 
-    monkeypatch.setattr(VerbParser, "parse_args", parse_verb)
-    monkeypatch.setattr(PoseCLI, "parse_arguments", parse_settings)
-    monkeypatch.setattr(figure_spec, "parse_figure_spec", end)
+    return parse_and_end
+
+
+@pytest.fixture
+def parse_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Commands end once their options are understood."""
+    monkeypatch.setattr(VerbParser, "parse_args", end_after(VerbParser.parse_args))
+    monkeypatch.setattr(PoseCLI, "parse_arguments", end_after(PoseCLI.parse_arguments))
 
 
 def fill_in(text: str, folder: str) -> list[str]:
@@ -147,13 +146,15 @@ def test_every_command_parses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 def test_a_renamed_option_does_not_parse(parse_only: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert not parses(f"{PROGRAM}fit --config configs/surf_lstm.yaml --data.folder DIR", tmp_path)
     assert not parses(f"{PROGRAM}report --with_baselines", tmp_path)
-    assert not parses(f"{PROGRAM}sweep sweeps/surf_lstm.yaml --data.folder DIR", tmp_path)
+    assert not parses(f"{PROGRAM}sweep sweeps/surf_lstm.yaml --trials 3", tmp_path)
 
 
-def test_scripts_exist() -> None:
-    scripts = [match[1] for command in COMMANDS if (match := re.match(r"python ([\w/]+\.py)", command.text))]
-    assert scripts
-    assert [script for script in scripts if not (REPOSITORY / script).is_file()] == []
+def test_files_that_commands_name_exist() -> None:
+    pattern = re.compile(r"(?:configs|sweeps|benchmarks|examples)/[a-z0-9_/]+\.(?:yaml|py)")
+    pages = [page for page in PAGES if page.name != "CONTRIBUTING.md"]  # whose new files tests write
+    named = {file for page in pages for file in pattern.findall(page.read_text())}
+    assert len(named) > 20
+    assert sorted(file for file in named if not (REPOSITORY / file).is_file()) == []
 
 
 def test_every_command_is_run_or_dated() -> None:
@@ -181,6 +182,23 @@ def test_the_commands_run(workplace: Workplace, tmp_path: Path, capsys: pytest.C
         assert workplace.command(*fill_in(f"{text} {small}", str(room))) == 0, capsys.readouterr().err
     assert (workplace.folder / "table.tex").is_file()
     assert "LandmarkMap" in capsys.readouterr().out
+    (run,) = (run for run in workplace.runs() if run.data.tags["architecture"] == "LandmarkMap")
+    shutil.copy(workplace.checkpoint(run, "best"), workplace.folder / "best.ckpt")
+    shutil.copy(next(room.rglob("*.png")), workplace.folder / "image.jpg")
+    for block in PYTHON:
+        if 'Localizer.load("best.ckpt")' in block:
+            with contextlib.chdir(workplace.folder):
+                exec(block, {})
+            assert "accepted" in capsys.readouterr().out
+
+
+def test_what_python_imports_exists() -> None:
+    assert len(PYTHON) > 6
+    for block in PYTHON:
+        for node in ast.walk(ast.parse(block)):
+            if isinstance(node, ast.ImportFrom) and str(node.module).startswith("lightning_pose"):
+                module = import_module(str(node.module))
+                assert [name.name for name in node.names if not hasattr(module, name.name)] == []
 
 
 def list_parameters(kind: type) -> set[str]:
@@ -202,12 +220,9 @@ def test_options_in_the_text_exist(capsys: pytest.CaptureFixture[str]) -> None:
     ):
         classes = [kind for name in names if isinstance(kind := getattr(package, name), type)]
         known |= {prefix + name for kind in classes for name in list_parameters(kind)}
-    named = {
-        option.rstrip(".")
-        for page in PAGES
-        for span in re.findall(r"`([^`\n]*)`", page.read_text())
-        if not span.startswith(SHELL)
-        for option in re.findall(r"(?<!\S)\[?(--[a-z][\w.]+)", span)
-    }
+    spans = [span for page in PAGES for span in re.findall(r"`([^`\n]*)`", page.read_text())]
+    spans = [span for span in spans if not span.startswith(SHELL)]
+    spans += [command.text for command in COMMANDS if command.text.startswith(PROGRAM)]
+    named = {option.rstrip(".") for span in spans for option in re.findall(r"(?<!\S)\[?(--[a-z][\w.-]+)", span)}
     assert len(named) > 20
     assert sorted(named - known) == []

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import pickle
 import random
 import sys
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -100,9 +102,42 @@ def test_a_stranger_s_checkpoint_runs_nothing(
         Localizer.load(file)
     for verb in ("predict", "test", "validate"):
         assert trained.workplace.command(verb, "--ckpt_path", file, allow=()) == 2
+    for words in (("localize", file, "a.png"), ("export", file, "--out", "out"), ("export-map", file, "out")):
+        (trained.workplace.folder / "a.png").touch()
+        assert trained.workplace.command(*words) == 2
     assert not marker.exists()
     assert not (trained.workplace.folder / "ran").exists()
     assert "Traceback" not in capsys.readouterr().err
+
+
+class Evil:
+    """Pickled, it asks whoever reads it to make a file."""
+
+    def __init__(self, marker: Path) -> None:
+        self.marker = marker
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return Path.touch, (self.marker,)
+
+
+@pytest.mark.parametrize("as_zip", [True, False])
+def test_a_pickle_in_a_checkpoint_is_not_run(as_zip: bool, marker: Path, tmp_path: Path) -> None:
+    checkpoint = torch.load(CHECKPOINT, weights_only=True)
+    file = tmp_path / "stranger.ckpt"
+    for place in ("state_dict", "lightning_pose", "hyper_parameters"):
+        torch.save(checkpoint | {place: Evil(marker)}, file, _use_new_zipfile_serialization=as_zip)
+        for read in (read_checkpoint, Localizer.load):
+            with pytest.raises(CheckpointError, match="cannot be read as a checkpoint"):
+                read(file)
+    assert not marker.exists()
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("archive/data.pkl", pickle.dumps(Evil(marker)))
+    with pytest.raises(CheckpointError):
+        read_checkpoint(file)
+    file.write_bytes(pickle.dumps(Evil(marker)))
+    with pytest.raises(CheckpointError):
+        read_checkpoint(file)
+    assert not marker.exists()
 
 
 def test_a_refused_class_is_named_with_the_remedy(marker: Path, tmp_path: Path) -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import importlib.util
+import signal
+import threading
 import time
-from importlib.util import find_spec
 from pathlib import Path
 
 from lightning_pose.commands.parser import VerbParser
@@ -33,7 +35,7 @@ INSTALL = 'python -m pip install "lightning-camera-localization[reconstruct]"'
 def main(argv: list[str]) -> int:
     """Run the command with the arguments after its name; return the exit code."""
     args = _build_parser().parse_args(argv)
-    if find_spec("pycolmap") is None:
+    if importlib.util.find_spec("pycolmap") is None:
         raise ConfigError(f"reconstruct needs pycolmap, which is not installed; `{INSTALL}` installs it")
     from lightning_pose.reconstruction.alignment import parse_distance, read_positions
     from lightning_pose.reconstruction.pipeline import reconstruct
@@ -42,12 +44,14 @@ def main(argv: list[str]) -> int:
     from lightning_pose.reconstruction.source import open_source
     from lightning_pose.reconstruction.workspace import open_workspace
 
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)  # pycolmap's own handler prints a stack of calls
     camera = None if args.camera is None else Camera.parse(args.camera)
     distance = None if args.scale is None else parse_distance(args.scale)
     known = {} if args.align is None else read_positions(args.align)
     wanted = [*known] if distance is None else [distance.first, distance.second]
     source = open_source(args.source)
-    settings = {"source": source.list_facts(), "every": args.every, "camera": camera and str(camera), "frames": wanted}
+    settings = {"source": source.list_facts(), "every": args.every, "camera": camera and str(camera)}
     workspace = open_workspace(args.out, settings)
     if workspace.changed:
         print(f"{args.out} is of another {' and '.join(workspace.changed)}; it is made anew")
@@ -71,8 +75,8 @@ def _build_parser() -> VerbParser:
         "--every",
         metavar="N",
         type=_parse_count,
-        help="choose the sharpest of each N frames; 1 takes all (default: one for each 4 %% of the image's width by "
-        "which the image moves)",
+        help="choose the sharpest of each N frames; 1 takes all (default: one for each 3 %% of the image's width by "
+        "which the image moves; all of a folder with up to 200 images)",
     )
     parser.add_argument(
         "--camera",

@@ -77,7 +77,7 @@ class TestReport(Callback):
         describe_run(logger, results_markdown(self.results, found.extras))
         best = checkpoint_folder(trainer) / "best.ckpt"
         if self.log_model and best.is_file():
-            log_localizer(logger, best)
+            log_localizer(logger, best, scene.frames[scene.splits["test"][0]].image)
         print(f"run {logger.run_id} in {logger.uri}")
 
 

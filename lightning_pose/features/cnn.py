@@ -97,7 +97,7 @@ class CNN(FeatureExtractor):
             "backbone": self.backbone,
             "weights": weights,
             "output": self.output,
-            "size": self._side,
+            "size": self.side,
             "crop": self.crop,
             "precision": "float16" if _choose_device().type == "cuda" else "float32",
         }
@@ -114,12 +114,12 @@ class CNN(FeatureExtractor):
             network, device = Backbone(self.backbone).eval(), torch.device("cpu")
         else:
             network, device = self._network, _choose_device()
-        rgb = torch.zeros(1, 3, self._side, self._side, device=device)
+        rgb = torch.zeros(1, 3, self.side, self.side, device=device)
         try:
             shape = tuple(self._run(network, rgb).shape[1:])
         except RuntimeError as error:
             raise ConfigError(
-                f"{self.backbone} cannot take images of size {self._side} ({error}); give a larger size, such as 224"
+                f"{self.backbone} cannot take images of size {self.side} ({error}); give a larger size, such as 224"
             ) from error
         if len(shape) != (3 if self.output == "map" else 1) or 0 in shape:
             raise ConfigError(
@@ -150,10 +150,23 @@ class CNN(FeatureExtractor):
     def features(self, record: Record) -> np.ndarray:
         return record["features"].astype(np.float32)
 
+    def load_network(self) -> nn.Module:
+        """The CNN with its weights, in evaluation mode: (B, 3, side, side) RGB in 0..1 to a vector or a map.
+
+        Raises:
+            CheckpointError: the weights cannot be downloaded or read.
+        """
+        return self._network
+
     @property
-    def _side(self) -> int:
+    def side(self) -> int:
         """Side of the square image that the network gets, in pixels."""
         return self.size or BACKBONES.get(self.backbone, BACKBONES["resnet50"]).size
+
+    @property
+    def short_side(self) -> int:
+        """Shorter side of the resized image before `center` cuts the square out of it, in pixels."""
+        return round(self.side * _RESIZE)
 
     @property
     def _network(self) -> nn.Module:
@@ -167,12 +180,12 @@ class CNN(FeatureExtractor):
 
     def _prepare(self, image: np.ndarray) -> Tensor:
         """(H, W, 3) uint8 -> (3, side, side) in 0..1."""
-        side = self._side
+        side = self.side
         height, width = image.shape[:2]
         rgb = torch.from_numpy(image).permute(2, 0, 1)[None].float() / 255
         if self.crop == "whole":
             return _resize_images(rgb, side, side)[0]
-        scale = round(side * _RESIZE) / min(height, width)
+        scale = self.short_side / min(height, width)
         rgb = _resize_images(rgb, round(height * scale), round(width * scale))
         top, left = (rgb.shape[2] - side) // 2, (rgb.shape[3] - side) // 2
         return rgb[0, :, top : top + side, left : left + side]

@@ -23,7 +23,14 @@ from lightning_pose.figures.style import (
     log_axis,
 )
 
-__all__ = ["MatchedImage", "draw_calibration", "draw_error_vs_inliers", "draw_map", "draw_matched_images"]
+__all__ = [
+    "MatchedImage",
+    "draw_calibration",
+    "draw_error_vs_inliers",
+    "draw_map",
+    "draw_matched_images",
+    "draw_trajectory",
+]
 
 REFUSED = "#D55E00"
 
@@ -115,6 +122,61 @@ def draw_map(
         aspect="equal",
         xlabel=f"{'xyz'[across]} ({unit})",
         ylabel=f"{'xyz'[up]} ({unit})",
+    )
+    figure.legend(loc="outside lower center", ncols=4)
+    return figure
+
+
+@matplotlib.rc_context(STYLE)
+def draw_trajectory(
+    points: np.ndarray | None,
+    position: np.ndarray,
+    accepted: np.ndarray,
+    down: np.ndarray | None = None,
+    title: str = "Trajectory",
+) -> Figure:
+    """A located trajectory over the map's points, from above.
+
+    Accepted images in a row are joined by a line; refused ones are crosses, between those before and after them.
+
+    Args:
+        points: (P, 3), of the map; None without one.
+        position: (N, 3), in order; nan where an image has no pose.
+        accepted: (N,) bool.
+        down: (3,), mean of the cameras' down axes; the axis of the world nearest to it is not drawn. By default, the
+            axis along which the camera moves least.
+        title: the heading.
+    """
+    rows = np.arange(len(position))
+    if accepted.any():
+        known = position[accepted]
+        position = np.column_stack([np.interp(rows, rows[accepted], column) for column in known.T])
+    else:
+        known = position[np.isfinite(position).all(axis=1)]
+        known = known if len(known) else np.zeros((1, 3))
+    points = known[:0] if points is None else points
+    plane = across, up = find_longest_axes(known)
+    if down is not None and down.any():
+        plane = across, up = [axis for axis in range(3) if axis != int(np.abs(down).argmax())]
+    held = np.concatenate([np.quantile(points, [0.02, 0.98], axis=0) if len(points) else known[:1], known])
+    low, high = held.min(axis=0)[list(plane)], held.max(axis=0)[list(plane)]
+    margin = 0.05 * (high - low).max() + SMALLEST
+    figure = Figure(figsize=(8, 7), dpi=150, layout="constrained")
+    axes = figure.add_subplot(title=title)
+    if len(points):
+        axes.plot(*points[:, plane].T, ".", color=TRAINING, markersize=1.5, label=f"{len(points):,} points of the map")
+    joined = np.where(accepted[:, None], position, np.nan)[:, plane]
+    axes.plot(*joined.T, "-", color=MODEL, linewidth=0.8, alpha=0.7)
+    for chosen, marker, color, label in ((accepted, ".", MODEL, "accepted"), (~accepted, "x", REFUSED, "refused")):
+        if chosen.any():
+            count = f"{label}, {chosen.sum()} of {len(chosen)}"
+            axes.plot(*position[chosen][:, plane].T, marker, color=color, markersize=5, label=count)
+    axes.set(
+        xlim=(low[0] - margin, high[0] + margin),
+        ylim=(low[1] - margin, high[1] + margin),
+        aspect="equal",
+        xlabel=f"{'xyz'[across]} (scene's unit)",
+        ylabel=f"{'xyz'[up]} (scene's unit)",
     )
     figure.legend(loc="outside lower center", ncols=4)
     return figure

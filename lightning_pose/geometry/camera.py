@@ -28,6 +28,12 @@ CAMERA_MODELS = {
 } | {model: " ".join(["fx fy cx cy", *names]) for model, names in LENS_PARAMETERS.items()}
 """COLMAP's camera models that are read, and the names of their parameters in order."""
 
+MAX_SIDE = 100_000
+"""Pixels of the widest image of a camera."""
+
+MAX_SHOWN = 200
+"""Characters of a camera in a message."""
+
 ITERATIONS = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-12)
 """When the search for an undistorted point ends."""
 
@@ -74,20 +80,25 @@ class Camera:
         >>> Camera.parse("SIMPLE_RADIAL,640,480,500,320,240,0.1").distortion
         (0.1, 0.0, 0.0, 0.0)
         """
+        shown = text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}..."  # it may come from a stranger
         name, *numbers = (part.strip() for part in text.split(","))
         name = name.upper()
         if name not in CAMERA_MODELS:
-            raise ConfigError(f"camera {text!r}: {name!r} is no camera model; give one of {', '.join(CAMERA_MODELS)}")
+            raise ConfigError(
+                f"camera {shown!r}: {name[:20]!r} is no camera model; give one of {', '.join(CAMERA_MODELS)}"
+            )
         names = CAMERA_MODELS[name].split()
         form = f"{name},WIDTH,HEIGHT,{','.join(names).upper()}"
         try:
             width, height, *values = (float(number) for number in numbers)
             found = dict(zip(names, values, strict=True))
         except ValueError:
-            raise ConfigError(f"camera {text!r} does not have the form {form}") from None
+            raise ConfigError(f"camera {shown!r} does not have the form {form}") from None
         fx, fy = found.get("fx", found.get("f", 0.0)), found.get("fy", found.get("f", 0.0))
         if not all(np.isfinite([width, height, *values])) or min(width, height, fx, fy) <= 0:
-            raise ConfigError(f"camera {text!r}: width, height and focal lengths must be above 0 ({form})")
+            raise ConfigError(f"camera {shown!r}: width, height and focal lengths must be above 0 ({form})")
+        if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
+            raise ConfigError(f"camera {shown!r}: width and height must be 1 to {MAX_SIDE} ({form})")
         fisheye = name.endswith("FISHEYE") or name in LENS_PARAMETERS
         if name in LENS_PARAMETERS:
             lens = tuple(found[key] for key in LENS_PARAMETERS[name])

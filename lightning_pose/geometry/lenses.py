@@ -31,7 +31,7 @@ def distort_points(points: Float[np.ndarray, "n 2"], coefficients: tuple[float, 
         coefficients: 1, 8 or 12 of them, see `LENS_PARAMETERS`.
 
     >>> distort_points(np.array([[0.0, 1.0]]), (1.0,)).round(4).tolist()
-    [[0.0, 0.8295]]
+    [[0.0, 0.8296]]
     """
     radius = np.linalg.norm(points, axis=1, keepdims=True)
     if len(coefficients) == 1:
@@ -49,7 +49,7 @@ def distort_points(points: Float[np.ndarray, "n 2"], coefficients: tuple[float, 
 def undistort_points(distorted: Float[np.ndarray, "n 2"], coefficients: tuple[float, ...]) -> Float[np.ndarray, "n 2"]:
     """The rays of image points: the inverse of `distort_points`; -1e6 where no ray in front of the camera goes there.
 
-    >>> undistort_points(np.array([[0.0, 0.8295]]), (1.0,)).round(3).tolist()
+    >>> undistort_points(np.array([[0.0, 0.8296]]), (1.0,)).round(3).tolist()
     [[0.0, 1.0]]
     """
     radius = np.linalg.norm(distorted, axis=1, keepdims=True)

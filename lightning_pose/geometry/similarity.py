@@ -21,6 +21,10 @@ class Similarity:
         scale: above 0.
         rotation: (3, 3).
         shift: (3,).
+
+    >>> old = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    >>> Similarity.fit(old, 2 * old + [0, 0, 5]).apply(np.array([0.0, 0, 1])).round(6).tolist()
+    [0.0, 0.0, 7.0]
     """
 
     scale: float
@@ -32,10 +36,6 @@ class Similarity:
         """The similarity with the smallest sum of squared distances (Umeyama, PAMI 1991); None if it is not unique.
 
         Three points that are not on one line are enough.
-
-        >>> old = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
-        >>> Similarity.fit(old, 2 * old + [0, 0, 5]).shift.round(6).tolist()
-        [0.0, 0.0, 5.0]
         """
         if len(old) < 3:
             return None

@@ -13,6 +13,9 @@ __all__ = ["enlarge_image"]
 MIN_ENLARGEMENT, MAX_ENLARGEMENT = 1.2, 4.0
 """By how much images are enlarged at least, and at most."""
 
+MAX_ENLARGED_PIXELS = 25_000_000
+"""Of an enlarged image: the camera may come from a stranger, and one of a tiny focal length would fill the memory."""
+
 
 def enlarge_image(array: np.ndarray, view: Camera, camera: Camera) -> np.ndarray:
     """The image with pixels as small an angle as in a map's images; the same array where they are not larger.
@@ -29,8 +32,8 @@ def enlarge_image(array: np.ndarray, view: Camera, camera: Camera) -> np.ndarray
         ConfigError: the image has another shape than those that the camera is for.
     """
     factor = view.focal_px / scale_camera(camera, array.shape[1], array.shape[0], setting="camera").focal_px
+    factor = min(factor, MAX_ENLARGEMENT, (MAX_ENLARGED_PIXELS / (array.shape[0] * array.shape[1])) ** 0.5)
     if factor < MIN_ENLARGEMENT:
         return array
-    factor = min(factor, MAX_ENLARGEMENT)
     size = round(array.shape[1] * factor), round(array.shape[0] * factor)
     return cv2.resize(array, size, interpolation=cv2.INTER_CUBIC)

@@ -17,14 +17,14 @@ from lightning_pose.scenes.images import decode_image, read_bytes, to_gray
 
 __all__ = ["ImageInput", "LoadedImage", "is_video", "list_images", "load_image"]
 
-ImageInput = str | Path | np.ndarray | Image.Image
-"""One image: a file, a uint8 array (H, W) gray or (H, W, 3) RGB, or a PIL image."""
+ImageInput = str | Path | bytes | np.ndarray | Image.Image
+"""One image: a file, the bytes of one, a uint8 array (H, W) gray or (H, W, 3) RGB, or a PIL image."""
 
 Color = Literal["gray", "rgb"]
 
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv", ".3gp")
 
-REMEDY = "give an image file, a uint8 array, a PIL image, or a list of these"
+REMEDY = "give an image file or its bytes, a uint8 array, a PIL image, or a list of these"
 
 ORIENTATION_TAG, EXIF_FOLDER, FOCAL_35MM_TAG = 0x0112, 0x8769, 0xA405
 """Tags of EXIF: the orientation, where the camera's own tags are, and the focal length on film of 36 x 24 mm."""
@@ -67,9 +67,9 @@ def list_images(images: object) -> Sequence[object] | None:
     Raises:
         ConfigError: it is neither.
     """
-    if isinstance(images, str | Path | Image.Image) or _is_image_array(images):
+    if isinstance(images, str | Path | bytes | Image.Image) or _is_image_array(images):
         return None
-    if isinstance(images, bytes | dict) or not isinstance(images, Iterable):
+    if isinstance(images, dict) or not isinstance(images, Iterable):
         raise ConfigError(f"images is {_describe(images)}; {REMEDY}")
     return list(images)
 
@@ -88,6 +88,8 @@ def load_image(image: object, color: Color, number: int = 0) -> LoadedImage:
     """
     if isinstance(image, str | Path):
         return _read_file(image, color)
+    if isinstance(image, bytes):
+        return _decode(image, "the image" if number == 0 else f"image {number}", color, None)
     if isinstance(image, Image.Image):
         orientation, focal = _read_exif(image)
         return LoadedImage(_convert_color(np.asarray(image.convert("RGB")), color), None, orientation, focal)
@@ -119,14 +121,25 @@ def _read_file(image: str | Path, color: Color) -> LoadedImage:
         raise ImageError(f"{image} is a folder; give its images, such as sorted(Path({str(image)!r}).glob('*.png'))")
     if is_video(path) and path.is_file():
         raise ImageError(f"{image} is a video among images; give it alone")
-    data = read_bytes(path)
-    array = decode_image(data, path, color == "rgb")
+    return _decode(read_bytes(path), path, color, str(image))
+
+
+def _decode(data: bytes, where: str | Path, color: Color, name: str | None) -> LoadedImage:
+    """An encoded image with what its EXIF block says.
+
+    Args:
+        data: the whole file.
+        where: it is from, for messages.
+        color: what the extractor reads.
+        name: of the image.
+    """
+    array = decode_image(data, where, color == "rgb")
     try:
         with Image.open(io.BytesIO(data)) as opened:
             orientation, focal = _read_exif(opened)
     except (OSError, ValueError, Image.DecompressionBombError):  # OpenCV reads more formats
         orientation, focal = 1, None
-    return LoadedImage(array, str(image), orientation, focal)
+    return LoadedImage(array, name, orientation, focal)
 
 
 def _read_exif(image: Image.Image) -> tuple[int, float | None]:

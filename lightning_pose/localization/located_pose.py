@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-__all__ = ["JsonValue", "LocatedPose", "stack_poses"]
+__all__ = ["JsonValue", "LocatedPose", "refuse_image", "stack_poses"]
 
 JsonValue = str | float | int | None | list["JsonValue"] | dict[str, "JsonValue"]
 """What a JSON file can hold."""
@@ -20,13 +20,15 @@ class LocatedPose:
     """A camera-to-world pose in the world of the training data, OpenCV axes, of the pixels as stored in the file.
 
     A refused pose is the best guess that there is: of the most similar training frame, or of the network beside a map.
+    An image that cannot be read has none: its numbers are nan.
 
     Attributes:
         position_m: (3,) float64, the camera's centre in the scene's unit.
         quat_wxyz: (4,) float64, unit, camera-to-world.
-        status: `accepted`, or `refused`. Systems without a map accept every image that can be read.
+        status: `accepted`, or `refused`. Systems without a map refuse blank images alone.
         reason: why it is refused; empty if it is accepted.
-        source: what the pose comes from: the landmark `map`, the `network`, or the `nearest` training frame.
+        source: what the pose comes from: the landmark `map`, the `network`, or the `nearest` training frame;
+            `none` if the image cannot be read.
         radius_m: holds 90 % of position errors, in the scene's unit; nan if unknown, inf if refused with no radius.
         radius_deg: the same of orientation errors, in degrees.
         covariance: (6, 6) float64: x, y, z in the scene's unit, then rotations about the world's x, y and z in rad, as
@@ -36,7 +38,9 @@ class LocatedPose:
         visible: points of the map that the image should show; None without a map.
         milliseconds: what each stage took: `read`, `features`, `locate`, and `total`.
         image: name of the image: its path as given, `VIDEO#FRAME`, or None for an array.
+        time_s: of a video's frame, from its beginning; None for an image.
         notes: what was done to the image, such as turned by its EXIF orientation.
+        inliers_px: (K, 2) float32, where the map's inliers are in the image; None without. Not in `to_dict`.
 
     >>> pose = LocatedPose(np.zeros(3), np.array([1.0, 0, 0, 0]), radius_m=0.02)
     >>> pose.accepted, pose.T_world_cam.shape
@@ -49,7 +53,7 @@ class LocatedPose:
     quat_wxyz: np.ndarray
     status: Literal["accepted", "refused"] = "accepted"
     reason: str = ""
-    source: Literal["map", "network", "nearest"] = "network"
+    source: Literal["map", "network", "nearest", "none"] = "network"
     radius_m: float = math.nan
     radius_deg: float = math.nan
     covariance: np.ndarray | None = None
@@ -57,7 +61,9 @@ class LocatedPose:
     visible: int | None = None
     milliseconds: Mapping[str, float] = field(default_factory=dict)
     image: str | None = None
+    time_s: float | None = None
     notes: tuple[str, ...] = ()
+    inliers_px: np.ndarray | None = field(default=None, repr=False)
 
     @property
     def accepted(self) -> bool:
@@ -81,6 +87,7 @@ class LocatedPose:
         """All attributes and `T_world_cam` in plain types, as JSON has them; numbers that are not finite are None."""
         return {
             "image": self.image,
+            "time_s": self.time_s,
             "status": self.status,
             "reason": self.reason,
             "source": self.source,
@@ -113,3 +120,15 @@ def stack_poses(poses: Sequence[LocatedPose]) -> tuple[np.ndarray, np.ndarray]:
     """
     position_m = np.array([pose.position_m for pose in poses], np.float64).reshape(-1, 3)
     return position_m, np.array([pose.quat_wxyz for pose in poses], np.float64).reshape(-1, 4)
+
+
+def refuse_image(image: str | None, reason: str) -> LocatedPose:
+    """The answer for an image that cannot be read: no pose, and the reason.
+
+    >>> refuse_image("a.jpg", "a.jpg is empty").to_dict()["position_m"]
+    [None, None, None]
+    """
+    nowhere = np.full(7, np.nan)
+    return LocatedPose(
+        nowhere[:3], nowhere[3:], "refused", reason, "none", radius_m=math.inf, radius_deg=math.inf, image=image
+    )

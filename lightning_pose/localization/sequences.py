@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -13,7 +14,7 @@ if TYPE_CHECKING:
     from lightning_pose.data import ClipDataModule
     from lightning_pose.models.base import PoseModule
 
-__all__ = ["Chained", "chain_test_split", "cut_windows", "locate_sequence"]
+__all__ = ["Chained", "ClipFollower", "chain_test_split", "cut_windows", "locate_sequence"]
 
 
 def cut_windows(frames: int, length: int) -> list[range]:
@@ -49,6 +50,38 @@ def locate_sequence(
         chain.add(list(window), pose.position_m[0], pose.quat_wxyz[0])
     _, position_m, quat_wxyz = chain.trajectory()
     return position_m, quat_wxyz
+
+
+class ClipFollower:
+    """Places the frames of a live video as they come: each by the clip of the last frames, which it ends.
+
+    Args:
+        model: of clips, in evaluation mode.
+        clip_length: frames of a clip, 2 or more, as in training.
+        relative_frame: axes of its positions, as in training.
+    """
+
+    def __init__(self, model: PoseModule, clip_length: int, relative_frame: RelativeFrame = "camera") -> None:
+        self._model = model
+        self._features: deque[Tensor] = deque(maxlen=clip_length)
+        self._chain = Chain(relative_frame)
+        self._count = 0
+
+    def add(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """The position (3,) and quaternion (4,) of the next frame, float64, in the axes of the first.
+
+        Args:
+            features: (*input_shape) of the frame.
+        """
+        self._features.append(features)
+        self._count += 1
+        numbers = list(range(self._count - len(self._features), self._count))
+        with torch.inference_mode():
+            pose = self._model(torch.stack(list(self._features)).unsqueeze(0).to(self._model.device))
+        self._chain.add(numbers, pose.position_m[0], pose.quat_wxyz[0])
+        for old in [number for number in self._chain.poses if number < numbers[0]]:
+            del self._chain.poses[old]  # no later clip begins there
+        return self._chain.poses[numbers[-1]]
 
 
 class Chained(NamedTuple):

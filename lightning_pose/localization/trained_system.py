@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,7 +21,9 @@ from lightning_pose.geometry.relative import RelativeFrame
 from lightning_pose.localization.image_sizes import enlarge_image
 from lightning_pose.localization.inputs import Color, LoadedImage
 from lightning_pose.localization.located_pose import LocatedPose
-from lightning_pose.localization.sequences import locate_sequence
+from lightning_pose.localization.sequences import ClipFollower, locate_sequence
+from lightning_pose.mapping.map_localizer import ShownPoints
+from lightning_pose.scenes.cameras import scale_camera
 from lightning_pose.scenes.images import to_gray
 
 if TYPE_CHECKING:
@@ -88,6 +91,15 @@ class TrainedSystem:
         network = self.model.map_network
         return None if network is None else network.view
 
+    def read_map_points(self) -> np.ndarray | None:
+        """(P, 3) points of the map in the world, in the scene's unit; None without a map."""
+        network = self.model.map_network
+        return (
+            None
+            if network is None
+            else self.model.world_frame.to_world(torch.from_numpy(network.point_map.points)).numpy()
+        )
+
     def locate(self, image: LoadedImage, camera: Camera | None = None, prior: CameraPose | None = None) -> LocatedPose:
         """Locate one image, as it is.
 
@@ -112,12 +124,24 @@ class TrainedSystem:
             keypoints = torch.from_numpy(refinement.extractor.features(of_map)[None])
         features = torch.from_numpy(extractor.features(record)[None])
         extracted = time.perf_counter()
+        size = for_map.shape[1], for_map.shape[0]
         with torch.inference_mode():
-            size = for_map.shape[1], for_map.shape[0]
-            answers = self.model.locate_images(features, [size], camera, keypoints)
+            answers = self.model.locate_images(features, [size], camera, keypoints, prior)
         ended = time.perf_counter()
         milliseconds = {"features": 1e3 * (extracted - started), "locate": 1e3 * (ended - extracted)}
-        return _read_answer(answers, milliseconds, image.name)
+        pose = _read_answer(answers, milliseconds, image.name)
+        if view is None or answers.shown[0] is None:
+            return pose
+        scale = np.array(image.size) / size
+        return replace(pose, inliers_px=self._find_inliers(answers.shown[0], camera or view, size, scale))
+
+    def _find_inliers(self, shown: ShownPoints, camera: Camera, size: tuple[int, int], scale: np.ndarray) -> np.ndarray:
+        """(K, 2) float32 pixels of the keypoints of inliers, in the image before it was enlarged by 1 / `scale`."""
+        network = self.model.map_network
+        assert network is not None, "it has answered"
+        seen = network.point_map.camera_correction.distort(shown.observed[shown.inlier])
+        pixels = scale_camera(camera, *size).project(seen)
+        return ((pixels + 0.5) * scale - 0.5).astype(np.float32)
 
     def locate_clip(self, images: Sequence[LoadedImage]) -> list[LocatedPose]:
         """Locate the frames of one video, in order, with a model of clips; the world is the first camera.
@@ -140,6 +164,23 @@ class TrainedSystem:
             LocatedPose(position, quat, milliseconds=milliseconds, image=image.name)
             for image, position, quat in zip(images, position_m.numpy(), quat_wxyz.numpy(), strict=True)
         ]
+
+    def start_clip(self) -> Callable[[LoadedImage], LocatedPose]:
+        """A function that places the frames of one video as they come, with a model of clips."""
+        assert self.clips is not None, "a model of clips"
+        follower = ClipFollower(self.model, *self.clips)
+
+        def locate_next(image: LoadedImage) -> LocatedPose:
+            started = time.perf_counter()
+            record = self.extractor.extract([image.array])[0]
+            features = torch.from_numpy(self.extractor.features(record))
+            extracted = time.perf_counter()
+            position_m, quat_wxyz = follower.add(features)
+            ended = time.perf_counter()
+            milliseconds = {"features": 1e3 * (extracted - started), "locate": 1e3 * (ended - extracted)}
+            return LocatedPose(position_m.numpy(), quat_wxyz.numpy(), milliseconds=milliseconds, image=image.name)
+
+        return locate_next
 
 
 def _read_answer(answers: Answers, milliseconds: dict[str, float], image: str | None) -> LocatedPose:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -21,9 +22,11 @@ from lightning_pose.mapping.frames import MapFrames
 from lightning_pose.mapping.guided_matching import match_pairs
 from lightning_pose.mapping.pairs import FEW_FRAMES, choose_pairs, estimate_depth
 from lightning_pose.mapping.point_map import PointMap, quantize_descriptors
+from lightning_pose.mapping.threads import map_in_threads
 from lightning_pose.mapping.tracks import join_tracks
 
 __all__ = [
+    "GATES_PX",
     "MappedFrames",
     "Tracks",
     "add_frames",
@@ -48,6 +51,9 @@ ADJUSTMENTS = 2
 
 HUBER_PX = 1.5
 """An observation counts in full up to this error."""
+
+PART = 2**14
+"""Observations whose tracks are refined at once: as many as fit a processor's cache."""
 
 GATES_PX = (12.0, 6.0, 3.0)
 """Observations farther than this from their point are left out, gate after gate."""
@@ -167,8 +173,7 @@ def _move_frames(state: Adjustment, given: MapFrames) -> MapFrames:
 
 def find_tracks(frames: MapFrames) -> Tracks:
     """Tracks of keypoints, at the least squares point of their rays."""
-    pairs = choose_pairs(frames, estimate_depth(frames.rotation, frames.position))
-    matches = match_pairs(frames, pairs)
+    matches = match_pairs(frames, choose_pairs(frames, estimate_depth(frames.rotation, frames.position)))
     matches = matches.select(vote_depths(frames, matches))
     track, frame, keypoint = join_tracks(matches, frames.points.shape[1], count_observations(frames))
     n_tracks = int(track[-1]) + 1 if len(track) else 0
@@ -176,12 +181,12 @@ def find_tracks(frames: MapFrames) -> Tracks:
     return Tracks(track, frame, keypoint, points)
 
 
-def triangulate_tracks(frames: MapFrames, tracks: Tracks) -> Tracks:
+def triangulate_tracks(frames: MapFrames, tracks: Tracks, gates_px: Sequence[float] = GATES_PX) -> Tracks:
     """Refined points, with the observations that agree with them; points with too few, or too narrow ones, are gone."""
-    for gate_px in GATES_PX:
+    for gate_px in gates_px:
         frame, observed = tracks.frame, frames.points[tracks.frame, tracks.keypoint]
         centre, rotation, focal_px = frames.position[frame], frames.rotation[frame], frames.focal_px[frame]
-        points = refine_points(tracks.points, tracks.track, centre, rotation, observed, HUBER_PX / focal_px)
+        points = _refine_in_parts(tracks, (centre, rotation, observed, HUBER_PX / focal_px))
         error = np.linalg.norm(reprojection_errors(points[tracks.track], centre, rotation, observed), axis=1)
         near = error * focal_px <= gate_px
         count = np.bincount(tracks.track[near], minlength=len(points))
@@ -190,6 +195,18 @@ def triangulate_tracks(frames: MapFrames, tracks: Tracks) -> Tracks:
     rays = find_rays(frames, tracks.frame, tracks.keypoint)
     wide = widest_angles_deg(tracks.track, rays, len(tracks.points)) >= MIN_ANGLE_DEG
     return tracks.select(wide[tracks.track])
+
+
+def _refine_in_parts(tracks: Tracks, columns: tuple[np.ndarray, ...]) -> np.ndarray:
+    """`refine_points` of some tracks at a time; `columns` are what it takes of each observation."""
+    starts = np.unique(tracks.track[::PART])
+
+    def refine(first: int, last: int) -> np.ndarray:
+        rows = slice(*np.searchsorted(tracks.track, [first, last]))
+        return refine_points(tracks.points[first:last], tracks.track[rows] - first, *(each[rows] for each in columns))
+
+    parts = map_in_threads(lambda ends: refine(*ends), pairwise([*starts.tolist(), len(tracks.points)]))
+    return np.concatenate([tracks.points[:0], *parts])
 
 
 def summarize_tracks(mapped: MappedFrames) -> PointMap:

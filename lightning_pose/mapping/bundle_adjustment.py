@@ -258,8 +258,7 @@ def _solve_schur(
     by_frame = np.argsort(frame, kind="stable")
 
     def sum_by_frame(values: np.ndarray) -> np.ndarray:
-        shape = values.shape[1:]
-        return sum_by_track(frame[by_frame], values.reshape(len(frame), -1)[by_frame], n_frames).reshape(-1, *shape)
+        return sum_by_track(frame, values.reshape(len(frame), -1), n_frames).reshape(-1, *values.shape[1:])
 
     def sum_by_point(values: np.ndarray) -> np.ndarray:
         return sum_by_track(track, values.reshape(len(track), -1), n_points).reshape(-1, *values.shape[1:])

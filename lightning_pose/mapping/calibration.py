@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lightning_pose.mapping.build_map import MappedFrames, summarize_tracks, triangulate_tracks
+from lightning_pose.mapping.build_map import GATES_PX, MappedFrames, summarize_tracks, triangulate_tracks
 from lightning_pose.mapping.frames import MapFrames
 from lightning_pose.mapping.map_localizer import MapAnswer, MapLocalizer
 from lightning_pose.mapping.threads import map_in_threads
@@ -19,6 +19,7 @@ __all__ = [
     "Measured",
     "calibrate_map",
     "find_conformal_factor",
+    "locate_frames",
     "measure_answers",
     "measure_frames",
 ]
@@ -74,7 +75,7 @@ def calibrate_map(mapped: MappedFrames) -> Calibration:
         kept = ~np.isin(mapped.tracks.frame, block)
         if not kept.any() or not len(block):
             return None
-        tracks = triangulate_tracks(mapped.seen, mapped.tracks.select(kept))
+        tracks = triangulate_tracks(mapped.seen, mapped.tracks.select(kept), GATES_PX[-1:])  # points hardly move
         localizer = MapLocalizer(summarize_tracks(replace(mapped, tracks=tracks)), without=block)
         frames = mapped.given.select(block[:: max(1, len(block) // FRAMES_PER_BLOCK)])
         return measure_answers([localizer.locate(frames.query(i)) for i in range(len(frames))], frames)
@@ -106,7 +107,12 @@ class Measured(NamedTuple):
 
 def measure_frames(localizer: MapLocalizer, frames: MapFrames) -> Measured:
     """Locate frames, and compare the answers with the poses that the frames have."""
-    return measure_answers(map_in_threads(lambda i: localizer.locate(frames.query(i)), range(len(frames))), frames)
+    return measure_answers(locate_frames(localizer, frames), frames)
+
+
+def locate_frames(localizer: MapLocalizer, frames: MapFrames) -> list[MapAnswer]:
+    """Answers for frames, whose own poses are not used."""
+    return map_in_threads(lambda i: localizer.locate(frames.query(i)), range(len(frames)))
 
 
 def measure_answers(answers: Sequence[MapAnswer], frames: MapFrames) -> Measured:

@@ -8,6 +8,7 @@ import numpy as np
 
 from lightning_pose.mapping.frames import MapFrames
 from lightning_pose.mapping.guided_matching import KeypointMatches
+from lightning_pose.mapping.threads import map_in_threads
 
 __all__ = ["vote_depths"]
 
@@ -16,6 +17,9 @@ AGREE_PX = 4.0
 
 SUPPORTERS = 2
 """Matches, the proposer included, that a depth needs."""
+
+PART = 2**16
+"""Directed matches whose keypoints are looked at at once."""
 
 CHUNK = 2**19
 """Pairs of a proposer and a voter looked at at once."""
@@ -41,10 +45,20 @@ def vote_depths(frames: MapFrames, matches: KeypointMatches, agree_px: float = A
     order = np.argsort(ids, kind="stable")
     group = np.cumsum(np.diff(ids[order], prepend=-1) != 0) - 1
     far, far_keypoint = matches.frame[:, ::-1].T.ravel()[order], matches.keypoint[:, ::-1].T.ravel()[order]
-    step, start = _find_rays(frames, ids[order] // n_keypoints, ids[order] % n_keypoints, far)
-    observed = frames.points[far, far_keypoint].T
-    depth = _find_depths(step, start, observed)
-    supports = _support_best(group, depth, *_find_depth_ranges(step, start, observed, agree_px / frames.focal_px[far]))
+    near, keypoint = np.divmod(ids[order], n_keypoints)
+
+    def support(first: int, last: int) -> np.ndarray:
+        part = slice(*np.searchsorted(group, [first, last]))
+        step, start = _find_rays(frames, near[part], keypoint[part], far[part])
+        observed = frames.points[far[part], far_keypoint[part]].T
+        depth = _find_depths(step, start, observed)
+        ranges = _find_depth_ranges(step, start, observed, agree_px / frames.focal_px[far[part]])
+        return _support_best(group[part] - first, depth, *ranges)
+
+    ends = [*np.unique(group[::PART]).tolist(), int(group[-1]) + 1] if len(group) else []
+    supports = np.concatenate(
+        [np.zeros(0, bool), *map_in_threads(lambda part: support(*part), itertools.pairwise(ends))]
+    )
     kept = np.zeros(len(matches.distance), bool)
     kept[order[supports] % len(kept)] = True
     return kept

@@ -29,6 +29,9 @@ RATIO = 0.8
 FAR = 1e6
 """Squared distance of rows that are no keypoints from all others."""
 
+ENLARGE = 1e6
+"""So much more than descriptors differ: what is left for places and sizes."""
+
 SAMPLE = 10
 """Frames of which one at least has keypoints, to look at their descriptors."""
 
@@ -81,38 +84,38 @@ def match_pairs(frames: MapFrames, pairs: np.ndarray, band_px: float = BAND_PX) 
         i, j = torch.from_numpy(a[chunk]), torch.from_numpy(b[chunk])
         lines = rays[i] @ torch.from_numpy(essential[chunk]).float().mT
         lines = lines / (lines[..., :2].norm(dim=-1, keepdim=True).clamp(min=1e-12) * band[j][:, None, None])
-        outside = _compare_places(lines, octaves[i], padding[i], rays[j], octaves[j], padding[j]) > 1
+        limit = _limit_by_places(lines, octaves[i], padding[i], rays[j], octaves[j], padding[j])
         similarity = torch.bmm(descriptors[i], descriptors[j].mT)
         if scale != 1:  # as if the descriptors differed so many times less
             similarity = similarity.sub_(1).div_(scale**2).add_(1)
-        similarity = similarity.masked_fill_(outside, -1.0)
-        return _take_mutual(similarity, start)
+        return _take_mutual(torch.minimum(similarity, limit, out=limit), start)
 
     pair, row_a, row_b, distance = _join(map_in_threads(match_chunk, range(0, len(pairs), BATCH)))
     return KeypointMatches(pairs[pair], np.stack([row_a, row_b], axis=1), distance)
 
 
-def _compare_places(
+def _limit_by_places(
     lines: Tensor, octaves_a: Tensor, padding_a: Tensor, rays_b: Tensor, octaves_b: Tensor, padding_b: Tensor
 ) -> Tensor:
-    """(B, N, N): squared distance of keypoint b to the line of keypoint a, and squared difference of their sizes.
+    """(B, N, N): above 1 where keypoint b may match keypoint a by its place and size, far below -1 elsewhere.
 
-    Both are in units of their limits. The squares are multiplied out, so that one product finds their sum.
+    The squared distance of b to the line of a and the squared difference of their sizes, in units of their limits, may
+    add up to 1. The squares are multiplied out, so that one product finds how much is left, many times enlarged.
     """
     x, y, w = lines.unbind(2)
-    of_a = [x * x, y * y, 2 * x * y, 2 * x * w, 2 * y * w, w * w + octaves_a**2 + padding_a, -2 * octaves_a]
+    of_a = [x * x, y * y, 2 * x * y, 2 * x * w, 2 * y * w, w * w + octaves_a**2 + padding_a - 1, -2 * octaves_a]
     u, v, one = rays_b.unbind(2)
     of_b = [u * u, v * v, u * v, u, v, one, octaves_b]
     of_a, of_b = [*of_a, one], [*of_b, octaves_b**2 + padding_b]
-    return torch.bmm(torch.stack(of_a, 2), torch.stack(of_b, 1))
+    return torch.bmm(torch.stack(of_a, 2) * -ENLARGE, torch.stack(of_b, 1))
 
 
 def _take_mutual(similarity: Tensor, first: int) -> tuple[np.ndarray, ...]:
     """Pair, row a, row b and descriptor distance of what is each other's best and clearly the best."""
     best_of_a, best_of_b = similarity.amax(2), similarity.amax(1)
     pair, row_a = (best_of_a > 1 - MAX_DISTANCE**2 / 2).nonzero(as_tuple=True)
-    of_a = similarity[pair, row_a]
-    value, row_b = of_a.max(1)
+    of_a = similarity.flatten(0, 1).index_select(0, pair * similarity.shape[1] + row_a)
+    value, row_b = best_of_a[pair, row_a], torch.from_numpy(of_a.numpy().argmax(axis=1))  # faster than torch's
     of_a.scatter_(1, row_b[:, None], -1.0)
     kept = (value == best_of_b[pair, row_b]) & ((1 - value) < RATIO**2 * (1 - of_a.amax(1)))
     pair, row_a, row_b, value = pair[kept], row_a[kept], row_b[kept], value[kept]

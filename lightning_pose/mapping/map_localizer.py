@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +25,12 @@ SIGMA_PX = 1.0
 INLIER_PX = 3.0
 ACCEPT_INLIERS = 20
 """Guided matches within 3 px that an accepted pose needs. With 12, poses came through that were metres off."""
+
+PRIOR = (0.5, 30.0)
+"""How far a pose may lie from a prior: in median depths of the map's points, and degrees."""
+
+PRIOR_PX = 64.0
+"""How far a keypoint may lie from where a prior puts its point."""
 
 KERNEL = (0.05, 5.0)
 """How far training frames lend their offset to an answer: in median depths of the map's points, and degrees."""
@@ -101,13 +107,64 @@ class MapLocalizer:
         self._adjusted = bool(np.abs(self._turn_back).max() > 1e-12 or np.abs(self._move_back).max() > 1e-12)
         frame, point = point_map.seen_frame, point_map.seen_point
         distance = np.linalg.norm(point_map.points[point] - point_map.position[frame], axis=1)
-        self._kernel = KERNEL[0] * (float(np.median(distance)) if len(distance) else 1.0)
+        self._depth = float(np.median(distance)) if len(distance) else 1.0
+        self._kernel = KERNEL[0] * self._depth
 
-    def locate(self, query: MapQuery) -> MapAnswer:
-        """Where the image was taken: candidates, matches, RANSAC, one guided pass, refinement."""
+    def locate(self, query: MapQuery, prior: CameraPose | None = None) -> MapAnswer:
+        """Where the image was taken: candidates, matches, RANSAC, one guided pass, refinement.
+
+        Args:
+            query: the image.
+            prior: where it may have been taken, in the poses that the dataset gives. A pose near it is accepted as
+                without. Where none is found, points that the image should show there are matched. A pose that is not
+                near it is refused.
+        """
         points = self._camera.remove(query.points)
-        similarity = self._matcher.compare(query.descriptors)
-        frame, rows, matched = self._matcher.match_candidates(similarity)
+        found = self._search(query, points)
+        if prior is None:
+            return found
+        near = self.carry_forward(prior)
+        away, turned = self._measure_distance(found.pose_in_map, near)
+        if found.accepted and away <= PRIOR[0] and turned <= PRIOR[1]:
+            return found
+        tracked = self._track(query, points, near)
+        if tracked is None and found.accepted:
+            reason = f"contradicts the prior: {away:.1f} times the scene's median depth and {turned:.0f} degrees away"
+            return replace(found, reason=reason)
+        return found if tracked is None else tracked
+
+    def _track(self, query: MapQuery, points: np.ndarray, near: CameraPose) -> MapAnswer | None:
+        """The accepted pose among the points that a pose of the map should show; None if there is none near it."""
+        matches = self._matcher.match_guided(query, points, near, PRIOR_PX)
+        found = self._solve(query, points, (-1, *matches[:2]))
+        if not found.accepted:
+            return None
+        away, turned = self._measure_distance(found.pose_in_map, near)
+        return found if away <= PRIOR[0] and turned <= PRIOR[1] else None
+
+    def _measure_distance(self, a: CameraPose, b: CameraPose) -> tuple[float, float]:
+        """Distance of two poses in median depths, and their angle in degrees."""
+        away = float(np.linalg.norm(a.position - b.position)) / self._depth
+        return away, float(np.degrees(np.linalg.norm(Rotation.from_matrix(a.rotation.T @ b.rotation).as_rotvec())))
+
+    def _search(self, query: MapQuery, points: np.ndarray) -> MapAnswer:
+        """The pose among the points of the most similar training frames."""
+        return self._solve(query, points, self._matcher.match_candidates(query.descriptors))
+
+    def _solve(
+        self,
+        query: MapQuery,
+        points: np.ndarray,
+        matches: tuple[int, np.ndarray, np.ndarray],
+    ) -> MapAnswer:
+        """The pose on which most matches agree, after one guided pass and refinement.
+
+        Args:
+            query: the image.
+            points: (N, 2), its keypoints with the camera's error removed.
+            matches: the frame whose pose holds where none is found, keypoints (K,) and points (K,).
+        """
+        frame, rows, matched = matches
         if len(rows) < MIN_MATCHES:
             few = f"too few features: {len(points)}" if len(points) < MIN_MATCHES else f"too few matches: {len(rows)}"
             return self._refuse(frame, few)
@@ -116,8 +173,8 @@ class MapLocalizer:
             return self._refuse(frame, f"weak geometry: no pose agrees with four of {len(rows)} matches")
         pose, mask = found
         sigma = SIGMA_PX / query.focal_px
-        pose = refine_pose(pose, self.map.points[matched[mask]], points[rows[mask]], 2 * sigma).pose
-        rows, matched, seen = self._matcher.match_guided(query, points, similarity, pose)
+        pose = refine_pose(pose, self.map.points[matched[mask]], points[rows[mask]], 2 * sigma, steps=3).pose
+        rows, matched, seen = self._matcher.match_guided(query, points, pose)
         visible = len(seen)
         if len(rows) < MIN_MATCHES:
             return self._refuse(frame, f"too few guided matches: {len(rows)} of {visible} points in view", visible)

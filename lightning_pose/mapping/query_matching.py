@@ -7,6 +7,7 @@ import numpy as np
 from lightning_pose.geometry.absolute_pose import CameraPose
 from lightning_pose.mapping.frames import MapQuery, find_distance_scale
 from lightning_pose.mapping.point_map import PointMap
+from lightning_pose.mapping.threads import multiply
 
 __all__ = ["QueryMatcher"]
 
@@ -15,6 +16,9 @@ CANDIDATES = 12
 
 VOTE_DISTANCE = 0.6
 """Largest distance of descriptors for a vote."""
+
+VOTE_COLUMNS = 24
+"""Dimensions in which the nearest point is found for a vote."""
 
 FRAME_PRIOR = 20.0
 """Points added to a frame's own when its votes are divided by the root of their number."""
@@ -45,7 +49,9 @@ class QueryMatcher:
 
     def __init__(self, point_map: PointMap) -> None:
         self.map = point_map
-        self._descriptors = np.ascontiguousarray(point_map.unit_descriptors.T)
+        self._descriptors = point_map.unit_descriptors
+        self._main_axes = find_main_axes(self._descriptors, VOTE_COLUMNS)
+        self._few_columns = multiply(self._main_axes.T, self._descriptors.T)
         length = np.bincount(point_map.seen_point, minlength=len(point_map))
         self._vote = 1 / np.sqrt(np.maximum(length, 1))
         self._points_of_frame = point_map.seen_count.astype(np.int64)
@@ -53,56 +59,54 @@ class QueryMatcher:
         self._frames = point_map.seen_frame[np.argsort(point_map.seen_point, kind="stable")]
         self._first_of_point = np.concatenate([[0], np.cumsum(length)])
 
-    def compare(self, descriptors: np.ndarray) -> np.ndarray:
-        """(N, P) cosines between an image's descriptors (N, D) and the map's, as they would be of SURF."""
-        similarity, scale = descriptors @ self._descriptors, find_distance_scale(descriptors)
-        return similarity if scale == 1 else 1 - (1 - similarity) / scale**2
-
-    def match_candidates(self, similarity: np.ndarray) -> tuple[int, np.ndarray, np.ndarray]:
+    def match_candidates(self, descriptors: np.ndarray) -> tuple[int, np.ndarray, np.ndarray]:
         """Mutual matches with what the most likely training frames saw.
 
-        Each keypoint's nearest point votes for the frames that saw it.
+        Each keypoint's nearest point votes for the frames that saw it; the nearest in few dimensions, which is found in
+        a third of the time and votes as well.
 
         Args:
-            similarity: (N, P), from `compare`.
+            descriptors: (N, D), of an image.
 
         Returns:
             the most likely frame (-1 for none), and the keypoints (K,) and points (K,) of the matches.
         """
-        if 0 in similarity.shape:
+        if not len(descriptors) or not len(self._descriptors):
             return -1, NONE, NONE
-        nearest = similarity.argmax(axis=1)
-        rows = np.arange(len(nearest))
-        voted = nearest[similarity[rows, nearest] > 1 - VOTE_DISTANCE**2 / 2]
+        rows = np.arange(len(descriptors))
+        nearest = multiply(multiply(descriptors, self._main_axes), self._few_columns).argmax(axis=1)
+        voted = nearest[self._compare(descriptors, rows, nearest) > 1 - VOTE_DISTANCE**2 / 2]
         first, last = self._first_of_point[voted], self._first_of_point[voted + 1]
         votes = np.bincount(
             self._frames[_join_ranges(first, last)], np.repeat(self._vote[voted], last - first), len(self.map.position)
         )
         score = votes / np.sqrt(self._points_of_frame + FRAME_PRIOR)
         best = np.argsort(-score, kind="stable")[:CANDIDATES]
-        points = np.unique(
-            self.map.seen_point[_join_ranges(self._first_of_frame[best], self._first_of_frame[best + 1])]
-        )
+        likely = np.zeros(len(self.map), bool)
+        likely[self.map.seen_point[_join_ranges(self._first_of_frame[best], self._first_of_frame[best + 1])]] = True
+        points = np.flatnonzero(likely)
         if len(points) < 2:
             return int(best[0]), NONE, NONE
-        among = similarity[:, points]
+        among = multiply(descriptors, self._descriptors[points].T)
         best_point = among.argmax(axis=1)
-        mutual = among.argmax(axis=0)[best_point] == rows
         value = among[rows, best_point]
+        mutual = among.max(axis=0)[best_point] == value
         among[rows, best_point] = -1
-        kept = mutual & (value > 1 - MATCH_DISTANCE**2 / 2) & (1 - value < MATCH_RATIO**2 * (1 - among.max(axis=1)))
+        away, second = 1 - value, 1 - among.max(axis=1)
+        near = away < MATCH_DISTANCE**2 / 2 * find_distance_scale(descriptors) ** 2
+        kept = mutual & near & (away < MATCH_RATIO**2 * second)
         return int(best[0]), rows[kept], points[best_point[kept]]
 
     def match_guided(
-        self, query: MapQuery, points: np.ndarray, similarity: np.ndarray, pose: CameraPose
+        self, query: MapQuery, points: np.ndarray, pose: CameraPose, radius_px: float = GUIDED_PX
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Mutual matches near where a pose puts the points that it should show.
 
         Args:
             query: the image.
             points: (N, 2), its keypoints with the camera's error removed.
-            similarity: (N, P), from `compare`.
             pose: where the camera is thought to be.
+            radius_px: how far a keypoint may lie from its point.
 
         Returns:
             keypoints (K,), points (K,), and where the points that should be in view appear, (V, 2) normalised image
@@ -116,17 +120,53 @@ class QueryMatcher:
             inside = (np.abs(seen) <= query.half_view).all(axis=1) & (local[:, 2] > 0)
         visible = np.flatnonzero(inside & (-(away * self.map.direction).sum(axis=1) >= MIN_COSINE * distance))
         seen = seen[visible]
-        squared = (points[:, None, 0] - seen[None, :, 0]) ** 2 + (points[:, None, 1] - seen[None, :, 1]) ** 2
-        row, column = np.nonzero(squared <= (GUIDED_PX / query.focal_px) ** 2)
+        row, column = find_near_places(points, seen, radius_px / query.focal_px)
         point = visible[column]
         octaves = np.log2(query.size_px[row] / query.focal_px) - (self.map.log_size[point] - np.log2(distance[point]))
-        value = similarity[row, point]
-        kept = (np.abs(octaves) <= SIZE_OCTAVES) & (value > 1 - GUIDED_DISTANCE**2 / 2)
+        alike = np.abs(octaves) <= SIZE_OCTAVES
+        row, point = row[alike], point[alike]
+        value = self._compare(query.descriptors, row, point)
+        kept = value > 1 - GUIDED_DISTANCE**2 / 2
         row, point, value = row[kept], point[kept], value[kept]
         best, second = _rank_within(row, value)
         best_of_point, _ = _rank_within(point, value)
         chosen = best & best_of_point & (1 - value < GUIDED_RATIO**2 * (1 - second))
         return row[chosen], point[chosen], seen
+
+    def _compare(self, descriptors: np.ndarray, row: np.ndarray, point: np.ndarray) -> np.ndarray:
+        """(K,) cosines between an image's descriptors and those of points, as they would be of SURF."""
+        similarity = np.einsum("kd,kd->k", descriptors[row], self._descriptors[point])
+        scale = find_distance_scale(descriptors)
+        return similarity if scale == 1 else 1 - (1 - similarity) / scale**2
+
+
+def find_main_axes(descriptors: np.ndarray, count: int) -> np.ndarray:
+    """(D, count or D) float32, the axes along which (P, D) descriptors are longest, in all."""
+    _, axes = np.linalg.eigh(multiply(descriptors.T, descriptors).astype(np.float64))
+    return np.ascontiguousarray(axes[:, ::-1][:, :count], dtype=np.float32)
+
+
+def find_near_places(points: np.ndarray, places: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns (K,) of points (N, 2) and places (V, 2) within a radius of each other, in ascending order.
+
+    The places are sorted into square cells, line by line, so that the three cells of a line beside a point are one
+    range.
+    """
+    if not len(points) or not len(places):
+        return NONE, NONE
+    low = places.min(axis=0) - radius
+    cell = ((places - low) / radius).astype(np.int64)
+    width, height = cell.max(axis=0) + 2
+    number = cell[:, 1] * width + cell[:, 0]
+    order = np.argsort(number, kind="stable")
+    number = number[order]
+    x, y = np.clip((points - low) / radius, 0, [width - 1, height - 1]).astype(np.int64).T
+    middle = (y * width + x)[:, None] + np.array([-width, 0, width])
+    first, last = np.searchsorted(number, middle - 1), np.searchsorted(number, middle + 1, side="right")
+    column = order[_join_ranges(first.ravel(), last.ravel())]
+    row = np.repeat(np.arange(len(points)), (last - first).sum(axis=1))
+    near = ((points[row] - places[column]) ** 2).sum(axis=1) <= radius**2
+    return np.divmod(np.sort(row[near] * len(places) + column[near]), len(places))
 
 
 def _join_ranges(first: np.ndarray, last: np.ndarray) -> np.ndarray:

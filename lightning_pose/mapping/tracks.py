@@ -41,12 +41,10 @@ def join_tracks(
                 a, b = b, a
             members[a] |= members[b]
             parent[b] = a
-    for node in range(len(nodes)):
-        root = node
-        while parent[root] != root:
-            root = parent[root]
-        parent[node] = root
-    _, track, length = np.unique(np.array(parent, np.int64), return_inverse=True, return_counts=True)
+    root = np.array(parent, np.int64)
+    while not np.array_equal(root, root[root]):
+        root = root[root]
+    _, track, length = np.unique(root, return_inverse=True, return_counts=True)
     kept = length[track] >= min_length
     number = np.cumsum(length >= min_length) - 1
     track, nodes = number[track[kept]], nodes[kept]

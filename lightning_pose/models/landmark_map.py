@@ -11,11 +11,12 @@ from torch import Tensor, nn
 
 from lightning_pose.data.batches import PoseBatch
 from lightning_pose.data.datamodule import SceneDataModule, scene_datamodule
+from lightning_pose.geometry.absolute_pose import CameraPose
 from lightning_pose.geometry.camera import Camera
 from lightning_pose.geometry.quaternions import quat_normalize
 from lightning_pose.mapping.map_localizer import MapAnswer
 from lightning_pose.models.base import PoseModule
-from lightning_pose.models.parts.answers import Answers, answer_by_map, convert_answers
+from lightning_pose.models.parts.answers import Answers, answer_by_map, convert_answers, localize_prior
 from lightning_pose.models.parts.frame_cameras import list_cameras, scale_cameras
 from lightning_pose.models.parts.map_builder import BundleAdjust, MapBuilder, check_bundle_adjust, check_keypoints
 from lightning_pose.models.parts.map_network import RESIZED, MapNetwork
@@ -139,10 +140,11 @@ class LandmarkMap(TrainingMemory, PoseModule):
         sizes: Sequence[tuple[int, int]],
         camera: Camera | None = None,
         keypoints: Tensor | None = None,
+        prior: CameraPose | None = None,
     ) -> Answers:
         """As any system, with the reason where the map refuses; `keypoints` are the features themselves."""
         cameras = scale_cameras(self.network.view if camera is None else camera, sizes)
-        found = self.network.locate(features, cameras)
+        found = self.network.locate(features, cameras, localize_prior(prior, self.world_frame))
         return answer_by_map(convert_answers(found, self.world_frame), found, self.network, self.world_frame.scale)
 
     def _list_cameras(self, frames: Tensor) -> list[Camera] | None:

@@ -137,7 +137,7 @@ class NodePose(TrainingMemory, PoseModule):
         self.forget_states()
 
     def decode_features(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        memory = self._compute_memory()
+        memory = self.compute_memory()
         table = search_neighbours(self._to_keys(features), memory.keys, self.neighbours)
         pose = self.network(self.standardize_input(features), memory.states, table)
         if self.neighbour_poses:
@@ -163,7 +163,7 @@ class NodePose(TrainingMemory, PoseModule):
         """Drop the training images' states; they are computed again when next needed."""
         self._memory = None
 
-    def _compute_memory(self) -> _Memory:
+    def compute_memory(self) -> _Memory:
         """What queries are compared with and what they receive, computed when first needed."""
         if self._memory is None or self._memory.keys.device != self.device:
             with torch.inference_mode(False), torch.no_grad():

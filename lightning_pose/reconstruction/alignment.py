@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
@@ -18,6 +19,11 @@ __all__ = ["KnownDistance", "align_positions", "find_frame", "parse_distance", "
 POSITION_COLUMNS = ("tx", "ty", "tz")
 IMAGE_COLUMNS = ("image", "file", "filename", "file_name", "path", "image_path", "name")
 FORM = "image,tx,ty,tz"
+
+NARROW = 0.1
+"""Share of their length by which known positions must lie beside the line through them, to fix the rotation well."""
+
+log = logging.getLogger("lightning_pose")
 
 
 class KnownDistance(NamedTuple):
@@ -155,6 +161,13 @@ def align_positions(
     found = Similarity.fit(old, new)
     if found is None:
         raise DataError(f"--align: the {len(used)} known positions are on one line; give one that is beside it")
+    spread = np.linalg.svd(new - new.mean(axis=0), compute_uv=False)
+    if spread[1] < NARROW * spread[0]:
+        log.warning(
+            "--align: the %d known positions are nearly on one line, so that the rotation about it is uncertain; give "
+            "one that is farther beside it",
+            len(used),
+        )
     errors = np.linalg.norm(found.apply(old) - new, axis=1)
     return found, dict(zip(used, errors.tolist(), strict=True))
 

@@ -53,6 +53,9 @@ class ImageDatabase:
     def has_features(self, row: int) -> bool:
         return self._database.exists_keypoints(row + 1)
 
+    def count_keypoints(self, row: int) -> int:
+        return self._database.num_keypoints_for_image(row + 1)
+
     def write_features(self, row: int, features: Features) -> None:
         keypoints, descriptors = features
         with pycolmap.DatabaseTransaction(self._database):

@@ -50,9 +50,11 @@ def match_all(
     read_camera = lru_cache(maxsize=None)(database.read_camera)
     tasks = ((a, b, read_features(a), read_features(b), (read_camera(a), read_camera(b))) for a, b in missing)
 
-    def compute(task: tuple[int, int, Features, Features, tuple]) -> tuple[int, int, pycolmap.TwoViewGeometry]:
-        a, b, *rest = task
-        return a, b, verify_pair(*rest)
+    def compute(
+        task: tuple[int, int, Features, Features, tuple[pycolmap.Camera, pycolmap.Camera]],
+    ) -> tuple[int, int, pycolmap.TwoViewGeometry]:
+        a, b, first, second, cameras = task
+        return a, b, verify_pair(first, second, cameras)
 
     found = 0
     for a, b, geometry in progress.track(_run_threads(compute, tasks, threads), step, len(missing)):

@@ -36,8 +36,8 @@ def describe_rows(rows: Iterable[int], names: Sequence[str]) -> str:
     """
     ordered = np.array(sorted(rows), int)
     runs = np.split(ordered, np.flatnonzero(np.diff(ordered) > 1) + 1) if len(ordered) else []
-    texts = [
-        names[run[0]] if len(run) == 1 else f"{names[run[0]]} to {names[run[-1]]} ({len(run)})" for run in runs[:6]
+    texts: list[str] = [
+        str(names[run[0]]) if len(run) == 1 else f"{names[run[0]]} to {names[run[-1]]} ({len(run)})" for run in runs[:6]
     ]
     more = [f"and {len(runs) - 6} more stretches"] if len(runs) > 6 else []
     return ", ".join([*texts, *more])

@@ -13,7 +13,7 @@ __all__ = ["FrameMeasures", "choose_frames", "measure_frames"]
 WIDTH = 320
 """Pixels to which frames are shrunk to be measured."""
 
-STEP = 0.04
+STEP = 0.03
 """Movement of the image, as a share of its width, for which one frame is chosen."""
 
 STILL = 0.0003

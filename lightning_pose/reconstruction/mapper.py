@@ -1,25 +1,26 @@
 """Runs pycolmap's mappers, in a process of their own: they print, and may end the process that they run in.
 
-`python -m lightning_pose.reconstruction.mapper METHOD DATABASE IMAGES OUT THREADS FIXED` writes models into OUT/0,
-OUT/1, ... and a line `registered N` for each image that is added.
+`python -m lightning_pose.reconstruction.mapper METHOD DATABASE OUT THREADS FIXED [MODEL]` writes OUT/0, OUT/1, ...
 """
 
 from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
+from typing import Literal
 
 from lightning_pose.errors import DataError
 
-__all__ = ["run_mapper"]
+__all__ = ["Method", "run_mapper"]
 
-ERROR = "error: "
+Method = Literal["global", "incremental"]
+
+SEED = 0
 
 
 def run_mapper(
-    method: str, database: Path, out: Path, threads: int, fixed_cameras: bool, on_image: Callable[[int], None] = int
+    method: Method, database: Path, out: Path, threads: int, fixed: bool, model: Path | None = None
 ) -> list[Path]:
     """Map the images of a database.
 
@@ -29,71 +30,101 @@ def run_mapper(
         database: with verified pairs; `global` changes the focal lengths in it.
         out: folder of the models, which should be empty.
         threads: how many.
-        fixed_cameras: whether the cameras in the database are right.
-        on_image: is called with the number of images that have been registered; by `incremental` only.
+        fixed: whether the cameras in the database are right.
+        model: folder of a model that `incremental` adds images to.
 
     Returns:
-        folders of models, in the order of their numbers; none if there is no first pair to begin with.
+        folders of models; none if there is no pair to begin with.
 
     Raises:
-        DataError: the mapper ended in another way; the message has its last line.
+        DataError: the mapper ended in another way.
     """
     out.mkdir(parents=True, exist_ok=True)
-    command = [sys.executable, "-m", __name__, method, str(database), str(out), str(threads), "0", str(fixed_cameras)]
+    words = [method, str(database), str(out), str(threads), str(fixed), *([] if model is None else [str(model)])]
     log = out / "mapper.log"
-    with log.open("w") as errors:
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True)
+    with log.open("w") as said:
+        process = subprocess.Popen([sys.executable, "-m", __name__, *words], stdout=said, stderr=said)
         try:
-            assert process.stdout is not None
-            for line in process.stdout:
-                if line.startswith("registered "):
-                    on_image(int(line.split()[1]))
+            process.wait()
         except BaseException:
             process.kill()
-            raise
-        finally:
             process.wait()
+            raise
     if process.returncode:
         raise DataError(f"pycolmap's {method} mapper ended with code {process.returncode}; {log} says why")
-    return sorted((path for path in out.iterdir() if path.name.isdecimal()), key=lambda path: int(path.name))
+    return sorted(path for path in out.iterdir() if path.name.isdecimal())
 
 
-def _map_global(database: Path, out: Path, threads: int, seed: int, fixed: bool) -> None:
+def _map_globally(database: Path, out: Path, threads: int, fixed: bool) -> None:
     import pycolmap
 
     if not fixed:
         calibration = pycolmap.ViewGraphCalibrationOptions()
-        calibration.random_seed = seed
+        calibration.random_seed, calibration.reestimate_relative_pose = SEED, False
         pycolmap.calibrate_view_graph(database, calibration)
+    _calibrate_pairs(database, threads)
     options = pycolmap.GlobalPipelineOptions()
-    options.num_threads, options.random_seed = threads, seed
+    options.num_threads, options.random_seed = threads, SEED
     options.mapper.bundle_adjustment.refine_focal_length = not fixed
     options.mapper.bundle_adjustment.refine_extra_params = not fixed
     pycolmap.global_mapping(database, out, out, options)
 
 
-def _map_incrementally(database: Path, out: Path, threads: int, seed: int, fixed: bool) -> None:
+def _calibrate_pairs(database: Path, threads: int) -> None:
+    """Find the essential matrix of each pair, now that focal lengths are known.
+
+    COLMAP calls half the pairs of a hand-held video planar or panoramic, because a homography explains most of their
+    matches as well, and its global mapper leaves these out: a walk falls into pieces. The rotations of their essential
+    matrices are sound; translations are not used, because the mapper places cameras by points.
+    """
+    from concurrent.futures import ThreadPoolExecutor
+
+    import numpy as np
+    import pycolmap
+
+    options = pycolmap.TwoViewGeometryOptions()
+    options.max_H_inlier_ratio, options.min_E_F_inlier_ratio = 1.0, 0.8
+    options.detect_watermark, options.compute_relative_pose = False, True
+    options.ransac.random_seed = SEED
+    with pycolmap.Database.open(database) as opened:
+        cameras = {camera.camera_id: camera for camera in opened.read_all_cameras()}
+        images = {image.image_id: image for image in opened.read_all_images()}
+        points = {number: opened.read_keypoints(number)[:, :2].astype(np.float64) for number in images}
+        pairs = [
+            (*pycolmap.pair_id_to_image_pair(number), geometry.inlier_matches)
+            for number, geometry in zip(*opened.read_two_view_geometries(), strict=True)
+            if len(geometry.inlier_matches)
+        ]
+
+        def calibrate(pair: tuple) -> pycolmap.TwoViewGeometry:
+            a, b, matches = pair
+            ends = (cameras[images[a].camera_id], points[a], cameras[images[b].camera_id], points[b])
+            return pycolmap.estimate_calibrated_two_view_geometry(*ends, matches, options)
+
+        with ThreadPoolExecutor(threads) as pool, pycolmap.DatabaseTransaction(opened):
+            for (a, b, _), geometry in zip(pairs, pool.map(calibrate, pairs), strict=True):
+                opened.update_two_view_geometry(a, b, geometry)
+
+
+def _map_incrementally(database: Path, out: Path, threads: int, fixed: bool, model: Path | None) -> None:
     import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads, options.random_seed, options.extract_colors = threads, seed, False
+    options.num_threads, options.random_seed, options.extract_colors = threads, SEED, False
+    options.multiple_models = model is None
     options.min_model_size = 3
     options.ba_refine_focal_length = options.ba_refine_extra_params = not fixed
-    count = 0
-
-    def report() -> None:
-        nonlocal count
-        count += 1
-        print(f"registered {count}", flush=True)
-
-    pycolmap.incremental_mapping(database, out, out, options, next_image_callback=report)
+    pycolmap.incremental_mapping(database, out, out, options, input_path=model or "")
 
 
 def main() -> None:
     """Map in this process."""
-    method, database, out, threads, seed, fixed = sys.argv[1:]
-    run = _map_global if method == "global" else _map_incrementally
-    run(Path(database), Path(out), int(threads), int(seed), fixed == "True")
+    method, database, out, threads, fixed, *model = sys.argv[1:]
+    places = Path(database), Path(out), int(threads), fixed == "True"
+    if method == "global":
+        _map_globally(*places)
+    else:
+        _map_incrementally(*places, Path(model[0]) if model else None)
 
 
 if __name__ == "__main__":

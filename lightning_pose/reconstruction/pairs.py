@@ -22,7 +22,16 @@ SAMPLE = 300
 
 
 def describe_frames(descriptors: list[np.ndarray]) -> np.ndarray:
-    """(N, D) float32 vectors of unit length that are near for frames that look alike: VLAD of descriptors (M, 128)."""
+    """Vectors that are near for frames that look alike: VLAD of descriptors.
+
+    Args:
+        descriptors: of N frames, (M, 128) uint8 each.
+
+    Returns:
+        (N, D) float32 of unit length; (N, 0) for so few frames that all are matched to all.
+    """
+    if len(descriptors) <= ALL_PAIRS:
+        return np.zeros((len(descriptors), 0), np.float32)
     from lightning_pose.features.retrieval import compute_global_vectors  # torch, which takes seconds to import
 
     rows = np.zeros((len(descriptors), SAMPLE, 128), np.float32)

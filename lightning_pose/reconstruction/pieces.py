@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,11 +10,15 @@ import numpy as np
 import pycolmap
 
 from lightning_pose.geometry.similarity import Similarity
+from lightning_pose.reconstruction.agreement import MatchedPair
 
 __all__ = ["SharedPoints", "add_piece", "find_shared_points", "join_pieces", "polish"]
 
 MIN_SHARED = 15
 """Points that must agree on how two pieces lie to each other."""
+
+MIN_SHARE = 0.2
+"""Share of all points that both have which must agree."""
 
 MIN_FRAMES = 2
 """Frames of the smaller piece that these points must be seen in, so that one wrong pair joins nothing."""
@@ -29,46 +33,58 @@ class SharedPoints(NamedTuple):
     Attributes:
         base: (N, 3).
         piece: (N, 3).
-        depth: (N,) distance from the camera of the base that sees it.
-        frame: (N,) number of the image of the piece that sees it.
+        base_depth: (N,) distance from a camera of the base that sees it.
+        piece_depth: (N,) the same in the piece.
+        frames: N sets of the images of the piece that see it.
     """
 
     base: np.ndarray
     piece: np.ndarray
-    depth: np.ndarray
-    frame: np.ndarray
+    base_depth: np.ndarray
+    piece_depth: np.ndarray
+    frames: list[set[int]]
 
 
 def find_shared_points(
     base: pycolmap.Reconstruction,
     piece: pycolmap.Reconstruction,
-    pairs: Iterable[tuple[int, int, np.ndarray]],
+    pairs: Sequence[MatchedPair],
 ) -> SharedPoints:
     """Points of two models that are one, by matches of an image of one with an image of the other.
 
     Args:
         base: the one model.
         piece: the other.
-        pairs: numbers of two images, and (K, 2) rows of their keypoints that match. An image that both models have
-            matches itself without being listed.
+        pairs: the matches. An image that both models have matches itself without being listed.
     """
     point_of_base, point_of_piece = (_list_point_numbers(model) for model in (base, piece))
     both = sorted(set(point_of_base) & set(point_of_piece))
     own = [(i, i, np.repeat(np.arange(len(point_of_base[i]))[:, None], 2, axis=1)) for i in both]
-    found: dict[tuple[int, int], tuple[int, int]] = {}
+    seen: dict[tuple[int, int], set[tuple[int, int]]] = {}
     for a, b, rows in [*own, *pairs]:
         for i, j, each in ((a, b, rows), (b, a, rows[:, ::-1])):
             if i not in point_of_base or j not in point_of_piece:
                 continue
             here, there = point_of_base[i][each[:, 0]], point_of_piece[j][each[:, 1]]
             for k in np.flatnonzero((here >= 0) & (there >= 0)):
-                found.setdefault((int(here[k]), int(there[k])), (i, j))
-    shared = [
-        (base.point3D(p).xyz, piece.point3D(q).xyz, base.image(i).projection_center(), j)
-        for (p, q), (i, j) in sorted(found.items())
-    ]
-    here, there, centre = (np.array([row[k] for row in shared]).reshape(-1, 3) for k in range(3))
-    return SharedPoints(here, there, np.linalg.norm(here - centre, axis=1), np.array([row[3] for row in shared], int))
+                seen.setdefault((int(here[k]), int(there[k])), set()).add((i, j))
+    found = sorted(seen)
+    views = [min(seen[each]) for each in found]
+    in_base, in_piece = (
+        np.array([model.point3D(each[side]).xyz for each in found]).reshape(-1, 3)
+        for side, model in enumerate((base, piece))
+    )
+    from_base, from_piece = (
+        np.array([model.image(view[side]).projection_center() for view in views]).reshape(-1, 3)
+        for side, model in enumerate((base, piece))
+    )
+    return SharedPoints(
+        in_base,
+        in_piece,
+        np.linalg.norm(in_base - from_base, axis=1),
+        np.linalg.norm(in_piece - from_piece, axis=1),
+        [{j for _, j in seen[each]} for each in found],
+    )
 
 
 def _list_point_numbers(model: pycolmap.Reconstruction) -> dict[int, np.ndarray]:
@@ -91,7 +107,8 @@ def fit_piece(shared: SharedPoints, seed: int = 0) -> Similarity | None:
         agree = _agree(Similarity.fit(shared.piece[rows], shared.base[rows]), shared)
         best = agree if agree.sum() > best.sum() else best
     for _ in range(3):
-        if best.sum() < MIN_SHARED or len(set(shared.frame[best].tolist())) < MIN_FRAMES:
+        frames = set().union(*(shared.frames[i] for i in np.flatnonzero(best)))
+        if best.sum() < max(MIN_SHARED, MIN_SHARE * len(best)) or len(frames) < MIN_FRAMES:
             return None
         found = Similarity.fit(shared.piece[best], shared.base[best])
         best = _agree(found, shared)
@@ -99,10 +116,11 @@ def fit_piece(shared: SharedPoints, seed: int = 0) -> Similarity | None:
 
 
 def _agree(found: Similarity | None, shared: SharedPoints) -> np.ndarray:
-    """(N,) which points lie where a similarity says."""
+    """(N,) which points lie where a similarity says, in both worlds: one that shrinks a piece to a point is none."""
     if found is None:
         return np.zeros(len(shared.base), bool)
-    return np.linalg.norm(found.apply(shared.piece) - shared.base, axis=1) < TOLERANCE * shared.depth
+    error = np.linalg.norm(found.apply(shared.piece) - shared.base, axis=1)
+    return error < TOLERANCE * np.minimum(shared.base_depth, found.scale * shared.piece_depth)
 
 
 def add_piece(base: pycolmap.Reconstruction, piece: pycolmap.Reconstruction, found: Similarity) -> int:
@@ -133,7 +151,7 @@ def add_piece(base: pycolmap.Reconstruction, piece: pycolmap.Reconstruction, fou
 
 
 def join_pieces(
-    models: Sequence[pycolmap.Reconstruction], pairs: Sequence[tuple[int, int, np.ndarray]]
+    models: Sequence[pycolmap.Reconstruction], pairs: Sequence[MatchedPair]
 ) -> list[pycolmap.Reconstruction]:
     """Add to the largest model the poses of each other one that lies to it in one way.
 

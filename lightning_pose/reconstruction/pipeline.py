@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -18,10 +18,9 @@ from lightning_pose.reconstruction.cameras import list_cameras
 from lightning_pose.reconstruction.database import open_database
 from lightning_pose.reconstruction.database_steps import extract_all, match_all
 from lightning_pose.reconstruction.diagnosis import PairFacts, diagnose
+from lightning_pose.reconstruction.find_poses import add_frames, find_poses
 from lightning_pose.reconstruction.frame_choice import choose_frames, measure_frames
-from lightning_pose.reconstruction.mapper import run_mapper
 from lightning_pose.reconstruction.pairs import choose_pairs, describe_frames
-from lightning_pose.reconstruction.pieces import join_pieces, polish
 from lightning_pose.reconstruction.progress import StepProgress
 from lightning_pose.reconstruction.source import Source
 from lightning_pose.reconstruction.workspace import Workspace
@@ -30,6 +29,9 @@ __all__ = ["PosedFrames", "reconstruct"]
 
 MIN_POSED = 3
 """Frames with a pose below which there is no scene."""
+
+FEW_PHOTOS = 200
+"""A folder of no more images is taken for photos, each of which is used."""
 
 SECOND_ALIKE = 20
 """How many frames that look alike a frame without a pose is matched to in the second round."""
@@ -69,7 +71,8 @@ def reconstruct(
     Args:
         source: the frames.
         workspace: where everything is kept.
-        every: choose the sharpest of so many frames; by default frames are chosen by how far the image moves.
+        every: choose the sharpest of so many frames. By default all images of a folder with up to 200 are used, and
+            others are chosen by how far the image moves.
         camera: of all frames, if it is known.
         wanted: frames that must be chosen, by name or number.
         progress: shows the steps.
@@ -77,40 +80,17 @@ def reconstruct(
     Raises:
         DataError: there are too few frames, or no scene comes out of them; the message has the reasons.
     """
-    threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     names = choose_and_write(source, workspace, every, wanted, progress)
     paths = [workspace.images / name for name in names]
-    with open_database(workspace.database) as database, threadpool_limits(1):
-        database.add_images(names, *list_cameras(paths, camera))
-        extract_all(database, paths, threads, progress)
-        with progress.wait("finding frames that look alike"):
-            descriptors = [database.read_features(row)[1] for row in range(len(names))]
-            counts = np.array([len(each) for each in descriptors])
-            vectors = describe_frames(descriptors)
-            del descriptors
-        match_all(database, choose_pairs(vectors), threads, "matching pairs", progress)
-    fixed = camera is not None
-    models = _map_frames(workspace, threads, fixed, progress)
-    with open_database(workspace.database) as database, threadpool_limits(1):
-        left = set(range(len(names))) - set(_list_posed(models))
-        again = [pair for pair in choose_pairs(vectors, SECOND_ALIKE) if set(pair) & left]
-        more = match_all(database, again, threads, "matching frames without a pose", progress)
-    if more:
-        models = _map_frames(workspace, threads, fixed, progress)
+    model = workspace.read_model() or _find_model(paths, workspace, camera, progress)
     with open_database(workspace.database) as database:
+        counts = np.array([database.count_keypoints(row) for row in range(len(names))])
         facts = [PairFacts(a, b, len(rows), kind) for a, b, rows, kind in database.list_pairs()]
-        matches = [(a + 1, b + 1, rows) for a, b, rows, _ in database.list_pairs()] if len(models) > 1 else []
-    if len(models) > 1:
-        count = len(_list_posed(models))
-        models = join_pieces(models, matches)
-        if len(_list_posed(models)) > count:
-            with progress.wait("adjusting joined pieces"):
-                polish(models[0], workspace.database, workspace.work / "joined", threads, fixed)
-    posed = _list_posed(models)
+    posed = () if model is None else tuple(sorted(number - 1 for number in model.reg_image_ids()))
     reasons = diagnose(names, counts, facts, posed)
-    if len(posed) < MIN_POSED:
+    if model is None or len(posed) < MIN_POSED:
         raise DataError(f"no poses were found for the {len(names)} frames of {source.path}: {'; '.join(reasons)}")
-    return PosedFrames(tuple(names), models[0], tuple(posed), tuple(reasons))
+    return PosedFrames(tuple(names), model, posed, tuple(reasons))
 
 
 def choose_and_write(
@@ -126,11 +106,14 @@ def choose_and_write(
     if kept is None:
         measures = measure_frames(progress.track(source.read_gray(), "choosing frames", source.count or None))
         count = len(measures.motion)
-        every_name = source.list_names(count)
-        rows = {find_frame(name, every_name) for name in wanted} - {None}
-        chosen = sorted({*choose_frames(measures, every).tolist(), *rows})
-        kept = {"chosen": chosen, "count": count}
-        workspace.keep("frames", kept)
+        every = 1 if every is None and not source.is_video and count <= FEW_PHOTOS else every
+        kept = {"chosen": choose_frames(measures, every).tolist(), "count": count}
+    every_name = source.list_names(kept["count"])
+    rows = {row for name in wanted if (row := find_frame(name, every_name)) is not None}
+    if not rows <= set(kept["chosen"]):
+        workspace.clear_results()  # of fewer frames
+        kept["chosen"] = sorted(rows.union(kept["chosen"]))
+    workspace.keep("frames", kept)
     chosen = kept["chosen"]
     print(f"{len(chosen)} of {kept['count']} frames of {source.path} are used", flush=True)
     if len(chosen) < MIN_POSED:
@@ -140,19 +123,28 @@ def choose_and_write(
     return list(progress.track(source.write(chosen, workspace.images), "writing frames", len(chosen)))
 
 
-def _map_frames(
-    workspace: Workspace, threads: int, fixed: bool, progress: StepProgress
-) -> list[pycolmap.Reconstruction]:
-    """The models that the mapper finds, the largest first."""
-    out, database = workspace.work / "models", workspace.work / "mapped.db"
-    shutil.rmtree(out, ignore_errors=True)
-    shutil.copyfile(workspace.database, database)  # the mapper changes focal lengths and geometries
-    with progress.wait("finding poses"):
-        folders = run_mapper("global", database, out, threads, fixed)
-    models = [pycolmap.Reconstruction(folder) for folder in folders]
-    return sorted(models, key=lambda model: -model.num_reg_images())
-
-
-def _list_posed(models: Sequence[pycolmap.Reconstruction]) -> list[int]:
-    """Rows of the frames with a pose in the first model; none without a model."""
-    return sorted(number - 1 for number in models[0].reg_image_ids()) if models else []
+def _find_model(
+    paths: Sequence[Path], workspace: Workspace, camera: Camera | None, progress: StepProgress
+) -> pycolmap.Reconstruction | None:
+    """Match the images and find their poses; the model is kept. None if there is none."""
+    threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    fixed = camera is not None
+    with open_database(workspace.database) as database, threadpool_limits(1):
+        database.add_images(
+            [path.relative_to(workspace.images).as_posix() for path in paths], *list_cameras(paths, camera)
+        )
+        extract_all(database, paths, threads, progress)
+        with progress.wait("finding frames that look alike"):
+            vectors = describe_frames([database.read_features(row)[1] for row in range(len(paths))])
+        match_all(database, choose_pairs(vectors), threads, "matching pairs", progress)
+    model = find_poses(workspace, len(paths), threads, fixed, progress)
+    if model is None:
+        return None
+    left = set(range(len(paths))) - {number - 1 for number in model.reg_image_ids()}
+    if left:
+        with open_database(workspace.database) as database, threadpool_limits(1):
+            again = [pair for pair in choose_pairs(vectors, SECOND_ALIKE) if set(pair) & left]
+            match_all(database, again, threads, "matching frames without a pose", progress)
+        model = add_frames(workspace, model, threads, fixed, progress)
+    workspace.keep_model(model)
+    return model

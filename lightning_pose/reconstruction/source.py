@@ -14,12 +14,11 @@ from lightning_pose.errors import DataError
 from lightning_pose.paths import replace_file
 from lightning_pose.scenes.formats.image_files import has_image_suffix, make_natural_key
 from lightning_pose.scenes.images import read_gray
+from lightning_pose.scenes.video_files import name_frame, read_video, write_frames
 
 __all__ = ["Source", "open_source"]
 
-JPEG_QUALITY = 95
-
-NO_COLOUR = re.compile(r"depth|disparity|mask|normals?\b", re.IGNORECASE)
+NO_COLOUR = re.compile(r"depth|disparity|mask", re.IGNORECASE)
 """Words in the path of an image that is no photo."""
 
 
@@ -47,10 +46,10 @@ class Source:
         return [[str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns] for file in files]
 
     def list_names(self, count: int) -> list[str]:
-        """The names that frames have when they are written, of the first so many."""
+        """The names that the first so many frames have when they are written."""
         if self.images:
             return [image.relative_to(self.path).as_posix() for image in self.images[:count]]
-        return [f"frame_{i:06d}.jpg" for i in range(count)]
+        return [name_frame(number) for number in range(count)]
 
     def read_gray(self) -> Iterator[np.ndarray]:
         """All frames in order, (H, W) uint8.
@@ -61,54 +60,23 @@ class Source:
         """
         if self.images:
             yield from map(read_gray, self.images)
-            return
-        for frame in self._read_video():
-            yield cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
+        else:
+            yield from (cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY) for frame in read_video(self.path))
 
     def write(self, chosen: Collection[int], folder: Path) -> Iterator[str]:
-        """Write frames as images below a folder, and yield their names there one by one.
+        """Write frames as images below a folder, and yield their names there one by one; files that are there stay.
 
-        Images of a folder are copied with their names; frames of a video become JPEG files that are named by their
-        numbers. Files that are there already stay.
+        Images of a folder are copied with their names; frames of a video are JPEG files, named by their numbers.
         """
-        wanted = sorted(chosen)
-        names = self.list_names(wanted[-1] + 1)
-        missing = {i for i in wanted if not (folder / names[i]).exists()}
-        frames = self._read_chosen(missing) if missing and self.is_video else iter(())
-        for i in wanted:
-            file = folder / names[i]
-            if i in missing:
-                data = _encode(next(frames)) if self.is_video else self.images[i].read_bytes()
-                replace_file(file, data, file.with_name(f"{file.name}.tmp"))
-            yield names[i]
-
-    def _read_chosen(self, chosen: Collection[int]) -> Iterator[np.ndarray]:
-        """Some frames of a video, in order."""
-        last = max(chosen)
-        for i, frame in enumerate(self._read_video()):
-            if i in chosen:
-                yield frame
-            if i == last:
-                return
-
-    def _read_video(self) -> Iterator[np.ndarray]:
-        """All frames of a video, (H, W, 3) uint8 BGR, upright."""
-        capture = cv2.VideoCapture(str(self.path))
-        try:
-            count = 0
-            while True:
-                found, frame = capture.read()
-                if not found:
-                    break
-                count += 1
-                yield frame
-            if not count:
-                raise DataError(
-                    f"{self.path} is no video that OpenCV reads; convert it, such as with `ffmpeg -i {self.path.name} "
-                    "video.mp4`, or give a folder of images"
-                )
-        finally:
-            capture.release()
+        if not self.images:
+            yield from (file.name for file in write_frames(self.path, chosen, folder))
+            return
+        for i in sorted(chosen):
+            name = self.images[i].relative_to(self.path).as_posix()
+            file = folder / name
+            if not file.exists():
+                replace_file(file, self.images[i].read_bytes(), file.with_name(f"{file.name}.tmp"))
+            yield name
 
 
 def open_source(path: Path) -> Source:
@@ -131,11 +99,6 @@ def open_source(path: Path) -> Source:
     count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) if capture.isOpened() else 0
     capture.release()
     return Source(path, (), max(count, 0))
-
-
-def _encode(frame: np.ndarray) -> bytes:
-    """A frame (H, W, 3) uint8 BGR as JPEG."""
-    return cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
 
 
 def _is_photo(file: Path, root: Path) -> bool:

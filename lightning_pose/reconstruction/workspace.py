@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import pycolmap
+
 from lightning_pose.errors import DataError
 from lightning_pose.paths import replace_file
 
@@ -63,6 +65,27 @@ class Workspace:
     def keep(self, name: str, value: Any) -> None:
         """Keep a value in plain types."""
         write_json(self.work / f"{name}.json", value)
+
+    def read_model(self) -> pycolmap.Reconstruction | None:
+        """The model that an earlier call kept, in its own unit."""
+        return pycolmap.Reconstruction(self._kept) if self._kept.is_dir() else None
+
+    def keep_model(self, model: pycolmap.Reconstruction) -> None:
+        """Keep a finished model."""
+        part = self._kept.with_suffix(".tmp")
+        shutil.rmtree(part, ignore_errors=True)
+        part.mkdir()
+        model.write(part)
+        part.rename(self._kept)
+
+    def clear_results(self) -> None:
+        """Delete features, matches and models, because the frames are others."""
+        shutil.rmtree(self._kept, ignore_errors=True)
+        self.database.unlink(missing_ok=True)
+
+    @property
+    def _kept(self) -> Path:
+        return self.work / "final"
 
 
 def write_json(file: Path, value: Any) -> None:

@@ -9,7 +9,7 @@ from lightning_pose.errors import ConfigError
 from lightning_pose.geometry.camera import Camera
 from lightning_pose.scenes.scene import Intrinsics, Scene
 
-__all__ = ["apply_camera", "make_camera", "scale_camera"]
+__all__ = ["apply_camera", "has_shape", "make_camera", "scale_camera"]
 
 ASPECT_TOLERANCE = 0.02
 """Share by which an image's width by height may differ from its camera's: sizes are rounded to whole pixels."""
@@ -53,10 +53,19 @@ def scale_camera(
     >>> scale_camera(Camera.parse("PINHOLE,640,480,500,500,319.5,239.5"), 320, 240).cx
     159.5
     """
-    if abs(width * camera.height / (height * camera.width) - 1) > max(ASPECT_TOLERANCE, 1 / min(width, height)):
+    if not has_shape(camera, width, height):
         raise ConfigError(
             f"{image} has {width}x{height} pixels, and its camera is for {camera.width}x{camera.height}: it was "
             f"cropped, squeezed or turned; give {setting} for its own size, such as "
             f"PINHOLE,{width},{height},FX,FY,CX,CY"
         )
     return camera if (width, height) == (camera.width, camera.height) else camera.resize(width, height)
+
+
+def has_shape(camera: Camera, width: int, height: int) -> bool:
+    """Whether an image of this width and height has the shape of a camera's images, at any scale.
+
+    >>> has_shape(Camera.parse("PINHOLE,640,480,500,500,319.5,239.5"), 480, 640)
+    False
+    """
+    return abs(width * camera.height / (height * camera.width) - 1) <= max(ASPECT_TOLERANCE, 1 / min(width, height))

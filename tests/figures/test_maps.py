@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
-from lightning_pose.figures.maps import MatchedImage, draw_matched_images
+from lightning_pose.figures.maps import MatchedImage, draw_matched_images, draw_trajectory
 
 
 def make_image(inliers: int) -> MatchedImage:
@@ -38,3 +38,17 @@ def test_points_lie_where_they_appear() -> None:
     assert isinstance(segments, LineCollection)
     np.testing.assert_allclose(segments.get_segments(), np.stack([image.projected, image.observed], 1))
     assert axes.get_ylim() == (47.5, -0.5)
+
+
+def test_a_trajectory_is_drawn_from_above_with_refused_images_between_the_others() -> None:
+    position = np.column_stack([np.arange(5.0), np.zeros(5), np.arange(5.0) ** 2])
+    position[2] = np.nan  # an image that could not be read
+    accepted = np.array([True, True, False, True, True])
+    points = np.random.default_rng(0).uniform(-1, 5, (50, 3))
+    figure = draw_trajectory(points, position, accepted, down=np.array([0.1, 0.9, 0.2]))
+    (axes,) = figure.axes
+    assert (axes.get_xlabel()[0], axes.get_ylabel()[0]) == ("x", "z")
+    (cross,) = (line for line in axes.lines if line.get_marker() == "x")
+    assert np.asarray(cross.get_xydata()).tolist() == [[2.0, 5.0]]
+    nowhere = draw_trajectory(None, np.full((2, 3), np.nan), np.zeros(2, bool))
+    assert nowhere.axes[0].get_legend_handles_labels()[1] == ["refused, 2 of 2"]

@@ -99,6 +99,9 @@ def test_no_pixels_give_no_rays() -> None:
         ("PINHOLE,640,480,500,500,320", "does not have the form PINHOLE,WIDTH,HEIGHT,FX,FY,CX,CY"),
         ("LENS,640,480,500", "'LENS' is no camera model; give one of SIMPLE_PINHOLE"),
         ("PINHOLE,640,480,0,500,320,240", "focal lengths must be above 0"),
+        ("PINHOLE,1e300,1e300,500,500,320,240", "width and height must be 1 to 100000"),
+        ("PINHOLE,0.5,480,500,500,320,240", "width and height must be 1 to 100000"),
+        ("X" * 10_000, r"^.{200,500}$"),
         ("PINHOLE,640,480,a,500,320,240", "does not have the form"),
     ],
 )

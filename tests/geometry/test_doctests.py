@@ -8,7 +8,7 @@ from importlib import import_module
 
 import pytest
 
-MODULES = ["interpolation", "quaternions", "relative", "two_view"]
+MODULES = ["interpolation", "lenses", "quaternions", "relative", "similarity", "two_view"]
 
 
 def find_examples(module: str) -> list[doctest.DocTest]:

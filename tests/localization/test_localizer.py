@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from mlflow import MlflowClient
 from PIL import Image
 
 from lightning_pose.checkpoint import read_checkpoint
@@ -68,7 +69,7 @@ def test_an_image_that_is_missing(localizer: Localizer) -> None:
     [
         (None, r"images is None \(NoneType\); give an image file"),
         (7, r"images is 7 \(int\)"),
-        (b"a.png", r"images is b'a.png' \(bytes\)"),
+        ({"image": "a.png"}, r"images is {'image': 'a.png'} \(dict\)"),
         ([None], r"image 0 is None \(NoneType\)"),
         (np.zeros((4, 5), np.float32), r"shape \(4, 5\) and type float32; give uint8 of shape \(H, W\) gray"),
         ([np.zeros((4, 5, 4), np.uint8)], r"shape \(4, 5, 4\) and type uint8"),
@@ -107,13 +108,57 @@ def test_a_checkpoint_without_data(trained: Trained, tmp_path: Path) -> None:
 def test_one_image_may_stand_alone(localizer: Localizer, images: list[Path]) -> None:
     (expected,) = localizer.localize(images[:1])
     in_color = Image.open(images[0]).convert("RGB")
-    for image in (images[0], str(images[0]), read_gray(images[0]), in_color, np.asarray(in_color)):
+    for image in (
+        images[0],
+        str(images[0]),
+        images[0].read_bytes(),
+        read_gray(images[0]),
+        in_color,
+        np.asarray(in_color),
+    ):
         pose = localizer.localize(image)
         np.testing.assert_array_equal(pose.position_m, expected.position_m)
         np.testing.assert_array_equal(pose.quat_wxyz, expected.quat_wxyz)
+    with pytest.raises(ImageError, match=r"^the image is truncated or is not an image"):
+        localizer.localize(b"a.png")
     with pytest.raises(ImageError, match=r"^a\.png does not exist"):
         localizer.localize("a.png")
 
 
+def test_a_blank_image_is_refused(localizer: Localizer) -> None:
+    rng = np.random.default_rng(0)
+    dark = localizer.localize(rng.integers(0, 4, (48, 64)).astype(np.uint8))
+    assert (dark.status, dark.reason, dark.source) == ("refused", "the image is blank", "network")
+    assert np.isinf(dark.radius_m)
+    assert localizer.localize(rng.integers(0, 255, (48, 64)).astype(np.uint8)).accepted
+
+
 def test_no_image_has_no_pose(localizer: Localizer) -> None:
     assert localizer.localize([]) == []
+
+
+def test_runs_and_registered_models(trained: Trained, images: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run by its id, its logged model, and a registered one by its alias give the checkpoint's poses."""
+    workplace, run_id = trained.workplace, trained.run.info.run_id
+    registered = f"wall-{run_id[:8]}"
+    client = MlflowClient(workplace.uri, workplace.uri)
+    client.create_registered_model(registered)
+    client.create_model_version(registered, f"runs:/{run_id}/model", run_id)
+    client.set_registered_model_alias(registered, "champion", "1")
+    expected = Localizer.load(trained.best, allow="tests").localize(images[0])
+    for source in (run_id, f"runs:/{run_id}/model", f"models:/{registered}@champion", f"models:/{registered}/1"):
+        found = Localizer.load(source, allow="tests", tracking_uri=workplace.uri).localize(images[0])
+        np.testing.assert_array_equal(found.position_m, expected.position_m)
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", workplace.uri)
+    assert Localizer.load(run_id, allow="tests").system.name == "SurfLSTM"
+    with pytest.raises(ConfigError, match=rf"has no model models:/{registered}@loser .*; check the name"):
+        Localizer.load(f"models:/{registered}@loser")
+    with pytest.raises(ConfigError, match=r"has no model runs:/0{32}/model"):
+        Localizer.load("0" * 32)
+
+
+def test_what_cannot_be_loaded(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match=r"nothing.ckpt does not exist; give a checkpoint such as"):
+        Localizer.load("nothing.ckpt")
+    with pytest.raises(ConfigError, match=r"is a folder without localizer.json"):
+        Localizer.load(tmp_path)

@@ -92,6 +92,23 @@ def test_an_image_without_keypoints_is_refused_at_a_training_pose(
     assert (np.abs(training.position - answer.pose.position).sum(axis=1) == 0).any()
 
 
+def test_a_prior_locates_what_looks_too_different(localizer: MapLocalizer, test: MapFrames) -> None:
+    """Descriptors so far from the map's that only those near their expected places are told apart."""
+    query, truth = test.query(5), CameraPose(test.rotation[5], test.position[5])
+    noise = np.random.default_rng(0).normal(0, 1, query.descriptors.shape)
+    noise /= np.linalg.norm(noise, axis=1, keepdims=True)
+    helped = []
+    for share in np.arange(1.0, 1.2, 0.05):
+        mixed = query.descriptors + share * noise
+        changed = replace(query, descriptors=(mixed / np.linalg.norm(mixed, axis=1, keepdims=True)).astype(np.float32))
+        if not localizer.locate(changed).accepted:
+            answer = localizer.locate(changed, truth)
+            if answer.accepted:
+                helped.append(np.linalg.norm(answer.pose.position - truth.position))
+    assert helped
+    assert max(helped) < 0.05
+
+
 def test_half_the_keypoints_wrong_still_locates(localizer: MapLocalizer, test: MapFrames) -> None:
     rng = np.random.default_rng(4)
     query = test.query(7)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -117,6 +118,25 @@ def test_a_checkpoint_holds_the_map(fitted: tuple[LandmarkMap, WallProblem]) -> 
     features = problem.dataset("test").data.features[:3]
     torch.testing.assert_close(rebuilt.eval()(features), model(features), rtol=0, atol=0)
     assert sum(value.nbytes for value in model.state_dict().values()) < 300_000
+
+
+def test_a_checkpoint_holds_arrays_in_half_their_bytes_if_that_loses_nothing(
+    fitted: tuple[LandmarkMap, WallProblem],
+) -> None:
+    model, _ = fitted
+    network, state = model.network, model.state_dict()
+    assert state["network.seen_point"].dtype == torch.uint16
+    assert state["network.points"].dtype == torch.float32
+    rebuilt: LandmarkMap = build_object(model.describe())
+    rebuilt.load_state_dict(state)
+    for name, value in vars(network.point_map).items():
+        np.testing.assert_array_equal(getattr(rebuilt.network.point_map, name), value)
+    network = deepcopy(network)
+    network.seen_point.data[-1] = 70_000
+    network.points.data[0, 0] = 1 + 2**-40
+    state = network.state_dict()
+    assert (state["seen_point"].dtype, int(state["seen_point"][-1])) == (torch.int32, 70_000)
+    assert (state["points"].dtype, float(state["points"][0, 0])) == (torch.float64, 1 + 2**-40)
 
 
 def test_answers_are_accepted_with_a_radius_or_refused_with_a_reason(fitted: tuple[LandmarkMap, WallProblem]) -> None:

@@ -19,6 +19,9 @@ __all__ = ["UPRIGHT_ANGLE", "compute_descriptors", "compute_orientations"]
 UPRIGHT_ANGLE = 270.0
 """Angle in degrees of keypoints whose orientation is not computed."""
 
+CHUNK = 150
+"""Keypoints whose windows are read at once on a CPU: as many as fit its cache."""
+
 CELLS = 21
 """Cells along a side of the window; each of the 20 x 20 samples is the Haar response of 2 x 2 cells."""
 
@@ -36,10 +39,10 @@ def compute_descriptors(
         angle: (K,) float32, degrees; None for upright windows.
     """
     window = torch.div(size * 14, 5, rounding_mode="floor")  # 21 * 1.2 / 9 of the size, without rounding errors
-    if angle is None:
-        patch = _sample_upright_patch(integral, image, xy, window)
-    else:
-        patch = _sample_rotated_patch(integral, image, xy, window, torch.deg2rad(angle))
+    columns = [image, xy, window, *([] if angle is None else [torch.deg2rad(angle)])]
+    sample = _sample_upright_patch if angle is None else _sample_rotated_patch
+    parts = zip(*(c.split(CHUNK if c.device.type == "cpu" else max(len(c), 1)) for c in columns), strict=True)
+    patch = torch.cat([sample(integral, *part) for part in parts], 2)
     filters = _make_filters(integral.device)
     smooth, change = (filters @ patch.flatten(1)).view(2, CELLS - 1, CELLS, -1)
     dx, dy = filters[CELLS - 1 :] @ smooth, filters[: CELLS - 1] @ change

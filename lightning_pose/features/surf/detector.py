@@ -20,7 +20,7 @@ from lightning_pose.features.surf.hessian import (
     compute_margin,
     view_head,
 )
-from lightning_pose.features.surf.strips import fill_octave
+from lightning_pose.features.surf.strips import StripProgram, get_program
 
 __all__ = ["Detections", "detect_keypoints", "find_maxima", "find_maxima_in_strips"]
 
@@ -136,14 +136,23 @@ def _allocate_planes(integral: Tensor) -> tuple[_Planes, list[Tensor]]:
 
 def find_maxima_in_strips(integral: Tensor, threshold: float) -> tuple[_Planes, Tensor, Tensor, Tensor]:
     """The maxima of one image (H + 1, W + 1), on a CPU: planes, and layer, place and determinant (1, C), by size."""
-    planes, octaves = _allocate_planes(integral[None])
-    keys = [np.zeros(0, np.int64)]
-    for octave, (det, start) in enumerate(zip(octaves, planes.grids[2].tolist(), strict=True)):
-        if det.numel():
-            found = fill_octave(integral.numpy(), octave, LOW, threshold, det[:, 0])
-            keys += [(place + start) * 4 + layer for layer, place in found]
+
+    height, width = integral.shape
+
+    def make() -> tuple[_Planes, StripProgram, list[int]]:
+        planes, octaves = _allocate_planes(integral[None])
+        sizes = [max(octave[0].numel(), 1) for octave in octaves]
+        return planes, StripProgram(height, width, [octave[:, 0] for octave in octaves], LOW), sizes
+
+    planes, program, sizes = get_program(height, width, make)
+    found = program.run(integral.numpy())
+    keys = [
+        (place % size + start) * 4 + place // size
+        for place, size, start in zip(found, sizes, planes.grids[2].tolist(), strict=True)
+    ]
     key = np.concatenate(keys)
     scores = planes.det.numpy()[key % 4, key // 4]
+    key, scores = key[scores > threshold], scores[scores > threshold]
     # One sort of whole numbers: positive floats are in the order of their bits, and equal ones in that of their places.
     key = np.sort((0x7FFFFFFF - scores.view(np.int32)).astype(np.int64) << 32 | key) & 0xFFFFFFFF
     layer, at = (torch.from_numpy(column)[None] for column in (key % 4, key // 4))
@@ -218,13 +227,11 @@ def _refine_candidates(integral: Tensor, planes: _Planes, found: _Candidates) ->
     width = planes.grids[1, found.octave]
     at = found.at + near.view(3, 1, 1) * width + near.view(3, 1)  # (3, 3, K): row, column
     plane = (found.layer - 1 + near[:, None]).clamp(0, 2)  # (3, K)
-    det = planes.det[plane[:, None, None], at]  # (3, 3, 3, K): layer, row, column
-    lowest, highest = found.layer == 1, found.layer == 3
-    outer = compute_determinants_at(
-        integral, found.octave, 4 * highest.long(), found.image, found.row, found.col
-    )  # layer 0 or 4, which `_Planes` does not hold
-    det[0] = torch.where(lowest, outer, det[0])
-    det[2] = torch.where(highest, outer, det[2])
+    index = plane[:, None, None] * planes.det.shape[1] + at
+    det = planes.det.view(-1).index_select(0, index.view(-1)).view(3, 3, 3, -1)  # layer, row, column
+    outer = (found.layer != 2).nonzero().squeeze(1)  # next to layer 0 or 4, which `_Planes` does not hold
+    layer, *place = (column[outer] for column in (found.layer, found.octave, found.image, found.row, found.col))
+    det[layer - 1, :, :, outer] = compute_determinants_at(integral, place[0], 2 * layer - 2, *place[1:]).movedim(2, 0)
 
     offset, inside = _find_top(det)
     strict = (det.view(27, -1) < det[1, 1, 1]).sum(0) == 26

@@ -20,6 +20,7 @@ from lightning_pose.features.base import LocalExtractor, Record
 from lightning_pose.features.surf.descriptor import UPRIGHT_ANGLE, compute_descriptors, compute_orientations
 from lightning_pose.features.surf.detector import detect_keypoints
 from lightning_pose.features.surf.hessian import compute_integral_image
+from lightning_pose.threads import use_one_thread
 
 __all__ = ["SURF", "SurfFeatures"]
 
@@ -126,7 +127,8 @@ class SURF(LocalExtractor):
 
     def _compute_features(self, gray: Tensor, n: int) -> SurfFeatures:
         """Compute the n strongest features of images (B, H, W) uint8, batch by batch."""
-        batches = [self._compute_batch(batch, n) for batch in gray.split(1 if gray.device.type == "cpu" else BATCH)]
+        with use_one_thread():
+            batches = [self._compute_batch(batch, n) for batch in gray.split(1 if gray.device.type == "cpu" else BATCH)]
         return SurfFeatures(*(torch.cat(column) for column in zip(*batches, strict=True)))
 
     def _compute_batch(self, gray: Tensor, n: int) -> SurfFeatures:

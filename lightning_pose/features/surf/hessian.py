@@ -19,13 +19,13 @@ from torch import Tensor
 __all__ = [
     "LAYERS",
     "OCTAVES",
-    "combine_derivatives",
     "compute_determinants",
     "compute_determinants_at",
     "compute_filter_size",
     "compute_integral_image",
     "compute_margin",
     "find_lobe_edges",
+    "scale_determinant",
     "view_head",
 ]
 
@@ -106,15 +106,16 @@ def compute_determinants(integral: Tensor, octave: int, layer: int, first: int, 
     band = torch.sub(band[..., :cols:u], band[..., c::u], out=view_head(whole[1], batch, n, m))
     dxy = view_head(scratch[0], batch, n, m).copy_(band)
 
-    combine_derivatives(dxx, dyy, dxy, size, out)
+    of_dxy, of_all = scale_determinant(size)
+    dxx.mul_(dyy).addcmul_(dxy, dxy, value=-of_dxy)
+    torch.mul(dxx, of_all, out=out)
 
 
-def combine_derivatives(dxx: Tensor, dyy: Tensor, dxy: Tensor, size: int, out: Tensor) -> None:
-    """Write the determinants of filters of this size, from their sums in float32, into `out`; overwrites dxx."""
+def scale_determinant(size: int) -> tuple[float, float]:
+    """Weight of dxy's square beside the product of dxx and dyy, and then of all, for sums of a filter of this size."""
     lobe, near, far, *_ = find_lobe_edges(size)
     area = lobe * (far - near)
-    dxx.mul_(dyy).addcmul_(dxy, dxy, value=-((0.9 * area / lobe**2) ** 2))
-    torch.mul(dxx, area**-2, out=out)
+    return (0.9 * area / lobe**2) ** 2, area**-2
 
 
 def compute_determinants_at(

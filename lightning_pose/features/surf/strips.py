@@ -1,22 +1,24 @@
-"""Determinants and their maxima on a CPU, in strips of rows: what a strip needs stays in the processor's cache.
+"""Determinants and their maxima on a CPU: calls that are listed once for images of a size, strip of rows by strip.
 
-The numbers are those of `hessian`, bit for bit. OpenCV subtracts whole numbers twice as fast as torch does.
+What a strip needs stays in the processor's cache, no memory is new (page faults take as long as the sums), and OpenCV
+subtracts whole numbers twice as fast as torch does. The numbers are those of `hessian`, bit for bit.
 """
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
 import cv2
 import numpy as np
 import torch
+from torch import Tensor
 
-from lightning_pose.features.surf.hessian import (
-    combine_derivatives,
-    compute_filter_size,
-    compute_margin,
-    find_lobe_edges,
-)
+from lightning_pose.features.surf.hessian import compute_filter_size, compute_margin, find_lobe_edges, scale_determinant
 
-__all__ = ["fill_octave"]
+__all__ = ["StripProgram", "get_program"]
 
 STRIP = 2**15
 """Samples of a strip: ten planes of it fit a cache of 2 MB."""
@@ -24,149 +26,160 @@ STRIP = 2**15
 LARGEST_FILTER = compute_filter_size(0, 3)
 """Of the layers here, in samples."""
 
+LARGEST_KEPT = 2**21
+"""Pixels of images whose program is kept for the next image; it has some 40 bytes a pixel."""
+
 SQUARE = np.ones((3, 3), np.uint8)
-
-Maxima = tuple[np.ndarray, np.ndarray]
-"""Layers less 1, and places in the plane (row * width + column)."""
+BUFFERS = 4
 
 
-class _Corners:
-    """An integral image in steps of 2**octave pixels, from any pixel on.
+class StripProgram:
+    """Finds the maxima of the determinant in images of one size; not for two threads at once.
 
     Args:
-        integral: (H + 1, W + 1) int32.
-        octave: the number of the octave.
+        height: of the integral images.
+        width: of the integral images.
+        planes: (3, h, w) float32 of each octave: where determinants of layers 1 to 3 are written to.
+        low: margin of the planes, in samples.
     """
 
-    def __init__(self, integral: np.ndarray, octave: int) -> None:
-        self._integral, self._octave = integral, octave
-        self._phases: dict[tuple[int, int], np.ndarray] = {}
+    def __init__(self, height: int, width: int, planes: list[Tensor], low: int) -> None:
+        self._integral = np.empty((height, width), np.int32)
+        self._low = low
+        self._steps: list[tuple[Any, ...]] = []
+        self._marks: list[np.ndarray] = []
+        for octave, plane in enumerate(planes):
+            plane.zero_()  # where filters do not fit
+            self._marks.append(np.zeros(plane.shape, bool))
+            if plane.numel():
+                self._phases: dict[tuple[int, int], np.ndarray] = {}
+                self._add_octave(octave, plane)
 
-    def view(self, y: int, x: int, rows: int, columns: int) -> np.ndarray:
-        """(rows, columns) int32, from pixel (y, x) on."""
-        step = 1 << self._octave
+    def run(self, integral: np.ndarray) -> list[np.ndarray]:
+        """Fill the planes, and find where no neighbour in layers 1 to 3 exceeds a sample: places in each octave's."""
+        np.copyto(self._integral, integral)
+        for function, *arguments in self._steps:
+            function(*arguments)
+        return [np.flatnonzero(marks) for marks in self._marks]
+
+    def _do(self, function: Callable[..., Any], *arguments: object) -> None:
+        """Call this function with these arguments in each run."""
+        self._steps.append((function, *arguments))
+
+    def _add_octave(self, octave: int, planes: Tensor) -> None:
+        _, height, width = planes.shape
+        rows = max(STRIP // width, 8)
+        size = (min(rows, height) + LARGEST_FILTER) * (width + LARGEST_FILTER)
+        self._whole, self._turn = np.empty((BUFFERS, size), np.int32), 0
+        self._real = torch.empty((4, size), device="cpu")
+        done = 0
+        for top in range(0, height, rows):
+            bottom = min(top + rows, height)
+            for layer, plane in enumerate(planes, 1):
+                inset = max(compute_margin(layer) - self._low, 0)
+                first, last = max(top, inset), min(bottom, height - inset)
+                if first < last and width > 2 * inset:
+                    out = plane[first:last, inset : width - inset]
+                    self._add_strip(octave, layer, (self._low + first, self._low + inset), out)
+            ready = bottom if bottom == height else bottom - 1  # the last row waits for its neighbours below
+            self._add_maxima(planes.numpy(), self._marks[octave], done, ready)
+            done = ready
+
+    def _add_strip(self, octave: int, layer: int, first: tuple[int, int], out: Tensor) -> None:
+        """A layer's determinants at the (n, m) samples from `first` on, into `out`."""
+        (n, m), step, size = out.shape, 1 << octave, compute_filter_size(octave, layer)
+        y0, x0 = ((sample - compute_margin(layer)) * step for sample in first)
+        lobe, near, far, one, other = find_lobe_edges(size)
+        t, apart = lobe // step, other - one
+        subtract = self._subtract
+
+        def change(y: int, x: int, down: int, along: int, rows: int, columns: int) -> np.ndarray:
+            """The integral's change from one pixel to another, `down` and `along` from it."""
+            end = self._view(octave, y0 + y + down, x0 + x + along, rows, columns)
+            return subtract(end, self._view(octave, y0 + y, x0 + x, rows, columns))
+
+        # Three differences are a sum over three adjoining lobes with weights 1, -2, 1.
+        band = change(near, 0, far - near, 0, n, m + 3 * t)
+        for _ in range(3):
+            band = subtract(band[:, t:], band[:, :-t])
+        dxx = self._convert(band, 0)
+        band = change(0, near, 0, far - near, n + 3 * t, m)
+        for _ in range(3):
+            band = subtract(band[t:], band[:-t])
+        dyy = self._convert(band, 1)
+
+        if apart % step:  # the lobes of dxy are not always whole samples apart
+            sides = []
+            for number, x in ((2, one), (3, other)):
+                band = subtract(*(change(y, x, lobe, 0, n, m + t) for y in (other, one)))
+                sides.append(self._convert(subtract(band[:, t:], band[:, :-t]), number))
+            dxy = sides[1]
+            self._do(dxy.sub_, sides[0])
+        else:
+            c = apart // step
+            band = change(one, one, lobe, 0, n + c, m + c + t)
+            band = subtract(band[c:], band[:-c])
+            band = subtract(band[:, t:], band[:, :-t])
+            dxy = self._convert(subtract(band[:, c:], band[:, :-c]), 2)
+        of_dxy, of_all = scale_determinant(size)
+        self._do(dxx.mul_, dyy)
+        self._do(partial(dxx.addcmul_, value=-of_dxy), dxy, dxy)
+        self._do(partial(torch.mul, out=out), dxx, of_all)
+
+    def _add_maxima(self, planes: np.ndarray, marks: np.ndarray, first: int, last: int) -> None:
+        """Marks in rows from `first` to `last` of planes (3, h, w), whose rows beside these are known."""
+        _, height, width = planes.shape
+        start = max(first - 1, 0)
+        one, two, three = layers = planes[:, start : last + 1]
+        lower, upper, every, peak = (buffer[: one.size].reshape(one.shape) for buffer in self._real.numpy())
+        self._do(cv2.max, one, two, lower)
+        self._do(cv2.max, two, three, upper)
+        self._do(cv2.max, lower, three, every)
+        for k, highest in enumerate((lower, every, upper)):
+            inset = compute_margin(k + 2) + 1 - self._low  # one sample more than the filters of the layer above need
+            top, bottom = max(first, inset), min(last, height - inset)
+            if top >= bottom or width <= 2 * inset:
+                continue
+            inner = slice(top - start, bottom - start), slice(inset, width - inset)
+            self._do(cv2.dilate, highest, SQUARE, peak)
+            self._do(np.greater_equal, layers[k][inner], peak[inner], marks[k, top:bottom, inset : width - inset])
+
+    def _view(self, octave: int, y: int, x: int, rows: int, columns: int) -> np.ndarray:
+        """(rows, columns) of the integral image in steps of 2**octave pixels, from pixel (y, x) on."""
+        step = 1 << octave
         phase = y % step, x % step
+        if step == 1:
+            self._phases[phase] = self._integral
         if phase not in self._phases:
-            self._phases[phase] = np.ascontiguousarray(self._integral[phase[0] :: step, phase[1] :: step])
-        y, x = y >> self._octave, x >> self._octave
+            part = self._integral[phase[0] :: step, phase[1] :: step]
+            self._phases[phase] = np.empty(part.shape, np.int32)
+            self._do(np.copyto, self._phases[phase], part)
+        y, x = y >> octave, x >> octave
         return self._phases[phase][y : y + rows, x : x + columns]
 
+    def _subtract(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """a - b; lasts until BUFFERS more are subtracted."""
+        self._turn = (self._turn + 1) % BUFFERS
+        difference = self._whole[self._turn, : a.size].reshape(a.shape)
+        self._do(cv2.subtract, a, b, difference)
+        return difference
 
-class _Scratch:
-    """Memory for one strip after the other.
-
-    Args:
-        size: largest number of elements of an array.
-    """
-
-    def __init__(self, size: int) -> None:
-        self._whole = np.empty((4, size), np.int32)
-        self._real = torch.empty((4, size), device="cpu")
-        self._turn = 0
-
-    def subtract(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """a - b; lasts until four more are subtracted."""
-        self._turn = (self._turn + 1) % 4
-        return cv2.subtract(a, b, dst=self._whole[self._turn, : a.size].reshape(a.shape))
-
-    def convert(self, values: np.ndarray, number: int) -> torch.Tensor:
+    def _convert(self, values: np.ndarray, number: int) -> Tensor:
         """Values as float32, in the memory of this number."""
-        return self._real[number, : values.size].view(values.shape).copy_(torch.from_numpy(values))
+        real = self._real[number, : values.size].view(values.shape)
+        self._do(real.copy_, torch.from_numpy(values))
+        return real
 
 
-def fill_octave(
-    integral: np.ndarray, octave: int, low: int, threshold: float, planes: torch.Tensor
-) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Compute the determinants of layers 1 to 3, and list those above the threshold that no neighbour exceeds.
-
-    Args:
-        integral: (H + 1, W + 1) int32.
-        octave: the number of the octave.
-        low: margin of the planes, in samples.
-        threshold: at least 0.
-        planes: (3, h, w) float32, written to; zero where a filter does not fit.
-
-    Returns:
-        layers less 1 (M,), and places in the plane (M,), row by row; for one part of the octave after the other.
-    """
-    _, height, width = planes.shape
-    rows = max(STRIP // width, 8)
-    corners = _Corners(integral, octave)
-    scratch = _Scratch((min(rows, height) + LARGEST_FILTER) * (width + LARGEST_FILTER))
-    found, done = [], 0
-    for top in range(0, height, rows):
-        bottom = min(top + rows, height)
-        for layer, plane in enumerate(planes, 1):
-            inset = max(compute_margin(layer) - low, 0)
-            if inset:
-                plane[top:bottom].zero_()
-            first, last = max(top, inset), min(bottom, height - inset)
-            if first < last and width > 2 * inset:
-                out = plane[first:last, inset : width - inset]
-                _compute_strip(corners, octave, layer, (low + first, low + inset), scratch, out)
-        ready = bottom if bottom == height else bottom - 1  # the last row waits for its neighbours below
-        found += _list_maxima(planes.numpy(), done, ready, low, threshold)
-        done = ready
-    return found
+_kept = threading.local()
 
 
-def _compute_strip(
-    corners: _Corners, octave: int, layer: int, first: tuple[int, int], scratch: _Scratch, out: torch.Tensor
-) -> None:
-    """Write a layer's determinants at the (n, m) samples from `first` on into `out`."""
-    (n, m), step, size = out.shape, 1 << octave, compute_filter_size(octave, layer)
-    y0, x0 = ((sample - compute_margin(layer)) * step for sample in first)
-    lobe, near, far, one, other = find_lobe_edges(size)
-    t, apart = lobe // step, other - one
-    subtract = scratch.subtract
-
-    def change(y: int, x: int, down: int, along: int, rows: int, columns: int) -> np.ndarray:
-        """The integral's change from one pixel to another, `down` and `along` from it."""
-        far = corners.view(y0 + y + down, x0 + x + along, rows, columns)
-        return subtract(far, corners.view(y0 + y, x0 + x, rows, columns))
-
-    # Three differences are a sum over three adjoining lobes with weights 1, -2, 1.
-    band = change(near, 0, far - near, 0, n, m + 3 * t)
-    for _ in range(3):
-        band = subtract(band[:, t:], band[:, :-t])
-    dxx = scratch.convert(band, 0)
-    band = change(0, near, 0, far - near, n + 3 * t, m)
-    for _ in range(3):
-        band = subtract(band[t:], band[:-t])
-    dyy = scratch.convert(band, 1)
-
-    if apart % step:  # the lobes of dxy are not always whole samples apart
-        sides = []
-        for number, x in ((2, one), (3, other)):
-            band = subtract(*(change(y, x, lobe, 0, n, m + t) for y in (other, one)))
-            sides.append(scratch.convert(subtract(band[:, t:], band[:, :-t]), number))
-        dxy = torch.sub(sides[1], sides[0], out=sides[0])
-    else:
-        c = apart // step
-        band = change(one, one, lobe, 0, n + c, m + c + t)
-        band = subtract(band[c:], band[:-c])
-        band = subtract(band[:, t:], band[:, :-t])
-        dxy = scratch.convert(subtract(band[:, c:], band[:, :-c]), 2)
-    combine_derivatives(dxx, dyy, dxy, size, out)
-
-
-def _list_maxima(planes: np.ndarray, first: int, last: int, low: int, threshold: float) -> list[Maxima]:
-    """Maxima in rows from `first` to `last` of planes (3, h, w), whose rows beside these are known."""
-    _, height, width = planes.shape
-    start = max(first - 1, 0)
-    one, two, three = planes[:, start : last + 1]
-    upper = cv2.max(one, two), cv2.max(two, three)
-    found = []
-    for k, highest in enumerate((upper[0], cv2.max(upper[0], three), upper[1])):
-        inset = compute_margin(k + 2) + 1 - low  # one sample more than the filters of the layer above need
-        top, bottom = max(first, inset) - start, min(last, height - inset) - start
-        if top >= bottom or width <= 2 * inset:
-            continue
-        inner = slice(top, bottom), slice(inset, width - inset)
-        values = (one, two, three)[k][inner]
-        at = np.flatnonzero(values >= cv2.dilate(highest, SQUARE)[inner])
-        row, column = np.divmod(at, width - 2 * inset)
-        above = values[row, column] > threshold
-        place = (row[above] + (start + top)) * width + column[above] + inset
-        found.append((np.full(len(place), k), place))
-    return found
+def get_program(height: int, width: int, make: Callable[[], Any]) -> Any:
+    """What `make` returns for images of this size: the same as for this thread's last image, if that was as large."""
+    if getattr(_kept, "size", None) != (height, width):
+        _kept.size = None  # what was kept is freed before there is more
+        _kept.program = None
+        if height * width > LARGEST_KEPT:
+            return make()
+        _kept.program, _kept.size = make(), (height, width)
+    return _kept.program

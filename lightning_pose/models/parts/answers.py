@@ -11,12 +11,13 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from lightning_pose.mapping.map_localizer import MapAnswer
+from lightning_pose.geometry.absolute_pose import CameraPose
+from lightning_pose.mapping.map_localizer import MapAnswer, ShownPoints
 from lightning_pose.models.parts.map_network import MapNetwork
 from lightning_pose.models.parts.poses import Pose
 from lightning_pose.models.parts.world_frame import WorldFrame
 
-__all__ = ["Answers", "answer_by_map", "answer_by_network", "convert_answers", "replace_accepted"]
+__all__ = ["Answers", "answer_by_map", "answer_by_network", "convert_answers", "localize_prior", "replace_accepted"]
 
 Source = Literal["network", "map", "nearest"]
 
@@ -38,6 +39,7 @@ class Answers:
         covariance: (M, 6, 6), of x, y, z in the scene's unit and of rotations about the world's axes in rad; nan where
             no map has a pose. It is that of the image errors, scaled until its 90 % spheres are the radii, where these
             are known.
+        shown: M, the map's points in each image; None where no map has a pose.
     """
 
     position_m: np.ndarray
@@ -49,6 +51,7 @@ class Answers:
     inliers: np.ndarray
     visible: np.ndarray
     covariance: np.ndarray
+    shown: tuple[ShownPoints | None, ...]
 
     def __len__(self) -> int:
         return len(self.source)
@@ -69,6 +72,7 @@ def answer_by_network(pose: Pose, radius_m: Tensor | None = None, radius_deg: Te
         none,
         none,
         np.full((count, 6, 6), np.nan),
+        (None,) * count,
     )
 
 
@@ -99,7 +103,8 @@ def answer_by_map(
     position_m, quat_wxyz = (part.detach().cpu().numpy() for part in pose)
     inliers, visible = (np.array([getattr(answer, name) for answer in found]) for name in ("inliers", "visible"))
     covariance = np.array([_turn_covariance(answer, scale, network) for answer in found]).reshape(-1, 6, 6)
-    return Answers(position_m, quat_wxyz, source, reason, radius_m, radius_deg, inliers, visible, covariance)
+    shown = tuple(answer.shown for answer in found)
+    return Answers(position_m, quat_wxyz, source, reason, radius_m, radius_deg, inliers, visible, covariance, shown)
 
 
 SPHERE = 1.4435
@@ -137,3 +142,10 @@ def convert_answers(answers: Sequence[MapAnswer], world_frame: WorldFrame) -> Po
     rotation = np.array([answer.pose.rotation for answer in answers]).reshape(-1, 3, 3)
     quats = torch.from_numpy(Rotation.from_matrix(rotation).as_quat(scalar_first=True))
     return Pose(world_frame.to_world(torch.from_numpy(position)), quats)
+
+
+def localize_prior(prior: CameraPose | None, world_frame: WorldFrame) -> CameraPose | None:
+    """A prior in the world as a map takes it."""
+    if prior is None:
+        return None
+    return CameraPose(prior.rotation, world_frame.to_local(torch.from_numpy(prior.position)).numpy())

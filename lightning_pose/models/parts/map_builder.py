@@ -15,12 +15,11 @@ from lightning_pose.features.base import FeatureExtractor, LocalExtractor
 from lightning_pose.geometry.absolute_pose import CameraPose
 from lightning_pose.geometry.camera import Camera
 from lightning_pose.mapping.build_map import MappedFrames, add_frames, adjust_mapped, map_frames, summarize_tracks
-from lightning_pose.mapping.calibration import UNKNOWN, calibrate_map, measure_frames
+from lightning_pose.mapping.calibration import UNKNOWN, calibrate_map, locate_frames, measure_answers
 from lightning_pose.mapping.conventions import fit_focal_length
 from lightning_pose.mapping.frame_matches import match_nearby_frames
 from lightning_pose.mapping.frames import MapFrames
-from lightning_pose.mapping.map_localizer import MapLocalizer
-from lightning_pose.mapping.threads import map_in_threads
+from lightning_pose.mapping.map_localizer import MapAnswer, MapLocalizer
 from lightning_pose.models.parts.frame_cameras import find_frequent_camera, list_cameras
 from lightning_pose.models.parts.map_network import MapNetwork, keypoints_to_frames
 from lightning_pose.models.parts.world_frame import WorldFrame
@@ -73,6 +72,7 @@ class MapBuilder:
         self._adjusts = bundle_adjust is True
         self._camera: Camera | None = None
         self._adjusted: MappedFrames | None = None
+        self._val_answers: list[MapAnswer] | None = None
 
     def build(self, splits: tuple[str, ...], calibrate: bool) -> None:
         """Build the map of the frames of these splits; unless it is only to be validated, find its radii too.
@@ -113,10 +113,9 @@ class MapBuilder:
         if self.bundle_adjust == "auto":
             if len(self.datamodule.scene.splits["val"]):
                 val = self._read_frames(("val",), camera)
-                before, after = (
-                    np.median(measure_frames(MapLocalizer(summarize_tracks(each)), val).position)
-                    for each in (plain, adjusted)
-                )
+                answers = [locate_frames(MapLocalizer(summarize_tracks(each)), val) for each in (plain, adjusted)]
+                before, after = (np.median(measure_answers(each, val).position) for each in answers)
+                self._val_answers = answers[1]
             else:
                 before, after = (calibrate_map(each).position_error for each in (plain, adjusted))
             self._adjusts = bool(after < before)
@@ -129,7 +128,7 @@ class MapBuilder:
         rows = np.searchsorted(np.sort(np.concatenate(numbers)), np.sort(numbers[0]))
         val = self._read_frames(("val",), camera)
         localizer = MapLocalizer(summarize_tracks(mapped))
-        answers = map_in_threads(lambda i: localizer.locate(val.query(i)), range(len(val)))
+        answers = self._val_answers or locate_frames(localizer, val)
         poses = [
             answer.pose_in_map if answer.accepted else localizer.carry_forward(CameraPose(rotation, position))
             for answer, rotation, position in zip(answers, val.rotation, val.position, strict=True)

@@ -10,11 +10,13 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
+from lightning_pose.geometry.absolute_pose import CameraPose
 from lightning_pose.geometry.camera import Camera
 from lightning_pose.mapping.calibration import Calibration
 from lightning_pose.mapping.frames import MapFrames
 from lightning_pose.mapping.map_localizer import MapAnswer, MapLocalizer
 from lightning_pose.mapping.point_map import PointMap
+from lightning_pose.mapping.threads import map_in_threads
 
 __all__ = ["MapNetwork", "keypoints_to_frames"]
 
@@ -35,6 +37,18 @@ MAP_SHAPES = {
     "camera": ((4,), torch.float64),
 }
 """Shape and type of each array of an empty `PointMap`; the descriptor's width is added."""
+
+STORED = {
+    "points": torch.float32,
+    "log_size": torch.float16,
+    "direction": torch.float16,
+    "seen_point": torch.uint16,
+    "rotation": torch.float32,
+    "position": torch.float32,
+    "given_rotation": torch.float32,
+    "given_position": torch.float32,
+}
+"""Types in which checkpoints hold arrays, if that loses nothing: half the bytes. Real numbers are rounded to them."""
 
 CAMERA_NUMBERS = 15
 
@@ -92,6 +106,7 @@ class MapNetwork(nn.Module):
         self.register_buffer("camera_numbers", torch.zeros(CAMERA_NUMBERS, dtype=torch.float64))
         self.register_buffer("calibration", torch.full((2,), torch.nan, dtype=torch.float64))
         self._localizer: MapLocalizer | None = None
+        self.register_state_dict_post_hook(_store_small)
         self.register_load_state_dict_post_hook(lambda module, _: module.forget_localizer())
 
     def forget_localizer(self) -> None:
@@ -102,8 +117,9 @@ class MapNetwork(nn.Module):
         """Take a map, the camera of queries that come without one, and the factors of its radii."""
         device = self.calibration.device
         for field in fields(point_map):
-            kind = MAP_SHAPES[field.name][1]
-            getattr(self, field.name).data = torch.from_numpy(getattr(point_map, field.name)).to(device, kind)
+            kind, values = MAP_SHAPES[field.name][1], torch.from_numpy(getattr(point_map, field.name))
+            rounded = values.to(STORED.get(field.name, kind)) if values.is_floating_point() else values
+            getattr(self, field.name).data = rounded.to(device, kind)
         lens = -len(camera.distortion) if camera.lens else int(camera.fisheye)
         numbers = [camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, lens]
         numbers += [*camera.distortion, *[0.0] * (8 - len(camera.distortion))]
@@ -125,12 +141,15 @@ class MapNetwork(nn.Module):
         coefficients = tuple(distortion[:count]) if any(distortion) else ()
         return Camera(int(width), int(height), fx, fy, cx, cy, coefficients, lens != 0)
 
-    def locate(self, features: Tensor, cameras: Sequence[Camera] | None = None) -> list[MapAnswer]:
+    def locate(
+        self, features: Tensor, cameras: Sequence[Camera] | None = None, prior: CameraPose | None = None
+    ) -> list[MapAnswer]:
         """Answers for (B, N, D + 4) features.
 
         Args:
             features: of B images.
             cameras: B, each for its image as it is; `view` for all if None.
+            prior: where all may have been taken, in the given poses' unit and origin.
 
         Raises:
             RuntimeError: there is no map yet.
@@ -142,7 +161,8 @@ class MapNetwork(nn.Module):
         nowhere = np.zeros((len(features), 3))
         cameras = [self.view] * len(features) if cameras is None else cameras
         frames = keypoints_to_frames(features, cameras, np.zeros((len(features), 3, 3)), nowhere)
-        return [self._localizer.locate(frames.query(i)) for i in range(len(frames))]
+        localizer = self._localizer
+        return map_in_threads(lambda i: localizer.locate(frames.query(i), prior), range(len(frames)))
 
     def find_radii(self, answers: list[MapAnswer]) -> tuple[np.ndarray, np.ndarray]:
         """(N,) radii, in the scene's unit and in degrees, that hold 90 % of the errors of accepted answers.
@@ -168,3 +188,12 @@ class MapNetwork(nn.Module):
                 for answer in self.locate(features, cameras)
             ]
         return torch.tensor(np.array(pose).reshape(-1, 7), dtype=features.dtype, device=features.device)
+
+
+def _store_small(module: nn.Module, state_dict: dict[str, Tensor], prefix: str, *_: object) -> None:
+    """Give a state dict the types of `STORED`, where they hold all values; loading turns them back."""
+    for name, kind in STORED.items():
+        values = state_dict[prefix + name]
+        small = values.to(kind)
+        if torch.equal(small.to(values.dtype), values):
+            state_dict[prefix + name] = small

@@ -36,4 +36,4 @@ def measure_motion(features: Tensor) -> Tensor:
     rows = torch.cat([place[..., :2], move], dim=-1) * matched[..., None]
     order = torch.where(matched, place[..., 0], torch.inf).argsort(-1)
     rows = rows.gather(2, order[..., None].expand_as(rows))
-    return torch.cat([torch.zeros_like(rows[:, :1]), rows], dim=1)
+    return torch.cat([rows.new_zeros(len(rows), 1, *rows.shape[2:]), rows], dim=1)

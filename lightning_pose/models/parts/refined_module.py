@@ -12,9 +12,16 @@ from torch import Tensor
 
 from lightning_pose.data.datamodule import SceneDataModule, scene_datamodule
 from lightning_pose.errors import CheckpointError, ConfigError, DataError
+from lightning_pose.geometry.absolute_pose import CameraPose
 from lightning_pose.geometry.camera import Camera
 from lightning_pose.geometry.quaternions import orientation_error_deg, position_error_m
-from lightning_pose.models.parts.answers import Answers, answer_by_map, answer_by_network, replace_accepted
+from lightning_pose.models.parts.answers import (
+    Answers,
+    answer_by_map,
+    answer_by_network,
+    localize_prior,
+    replace_accepted,
+)
 from lightning_pose.models.parts.checkpoint_hooks import CheckpointHooks
 from lightning_pose.models.parts.error_radius import ErrorRadius
 from lightning_pose.models.parts.frame_cameras import scale_cameras
@@ -138,6 +145,7 @@ class RefinedModule(CheckpointHooks):
         sizes: Sequence[tuple[int, int]],
         camera: Camera | None = None,
         keypoints: Tensor | None = None,
+        prior: CameraPose | None = None,
     ) -> Answers:
         """Answers for images from anywhere, as a `Localizer` has them.
 
@@ -146,6 +154,7 @@ class RefinedModule(CheckpointHooks):
             sizes: width and height of each image, in pixels; only maps use them.
             camera: of all images, scaled to each; that of the training images if None.
             keypoints: (B, N, D + 4) of the same images, by the extractor of `refinement`, where there is one.
+            prior: where all may have been taken, in the world; only maps use it.
 
         Raises:
             ConfigError: a camera is given, and there is no map that reads it; or it is for images of another shape.
@@ -157,7 +166,8 @@ class RefinedModule(CheckpointHooks):
         if self.refinement is None or not self.refinement.has_map or keypoints is None:
             return alone
         network = self.refinement.network
-        found = network.locate(keypoints, scale_cameras(network.view if camera is None else camera, sizes))
+        cameras = scale_cameras(network.view if camera is None else camera, sizes)
+        found = network.locate(keypoints, cameras, localize_prior(prior, self.world_frame))
         refined = replace_accepted(pose, found, self.world_frame)
         return answer_by_map(refined, found, network, self.world_frame.scale, alone)
 

@@ -23,7 +23,7 @@ from lightning_pose.scenes.formats.poses import check_quats
 from lightning_pose.scenes.formats.text_files import NumberTable, find_file, list_files, read_lines, read_table
 from lightning_pose.scenes.scene import Frame, Intrinsics, Scene, Trajectory
 
-__all__ = ["FORMAT", "TRAJECTORY_COLUMNS", "Tum", "is_numbered", "pair_by_time"]
+__all__ = ["FORMAT", "TRAJECTORY_COLUMNS", "Tum", "convert_to_seconds", "is_numbered", "pair_by_time"]
 
 log = logging.getLogger("lightning_pose")
 
@@ -62,7 +62,7 @@ class Tum(SceneFormat):
         trajectory = find_file(root, "groundtruth.txt")
         table = read_table(trajectory, TRAJECTORY_COLUMNS)
         _warn_of_rows_without_time(trajectory, table)
-        pose_times = _convert_to_seconds(table.values[:, 0], table.header, trajectory)
+        pose_times = convert_to_seconds(table.values[:, 0], table.header, trajectory)
         _warn_of_equal_times(trajectory, pose_times)
         if _counts_frames(pose_times):
             log.warning("%s counts frames: if it is ICL-NUIM, with y up in the world, give format icl_nuim", trajectory)
@@ -177,11 +177,11 @@ def _read_timed_images(root: Path, path: Path) -> ImageList:
     warn_of_unlisted_images((image for _, image in found), path.name)
     chosen = choose_listed_images(image for _, image in found)
     found = sorted(entry for entry in found if entry[1] in chosen)
-    times = _convert_to_seconds(np.array([time for time, _ in found]), header, path)
+    times = convert_to_seconds(np.array([time for time, _ in found]), header, path)
     return ImageList(times, [image for _, image in found], faults)
 
 
-def _convert_to_seconds(times: np.ndarray, header: Sequence[str], path: Path) -> np.ndarray:
+def convert_to_seconds(times: np.ndarray, header: Sequence[str], path: Path) -> np.ndarray:
     """Times in seconds, with a warning if the file has another unit.
 
     The unit is nanoseconds if the header names them. Otherwise it follows from the times: seconds since 1970 have 10

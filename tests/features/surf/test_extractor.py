@@ -6,6 +6,7 @@ angle where oriented) and descriptors (in 127ths) of OpenCV's SURF with 4 octave
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
@@ -17,7 +18,7 @@ from torch import Tensor
 from lightning_pose.errors import ConfigError, ImageError
 from lightning_pose.features.surf import SURF
 from lightning_pose.features.surf.descriptor import compute_descriptors, compute_orientations
-from lightning_pose.features.surf.detector import detect_keypoints
+from lightning_pose.features.surf.detector import detect_keypoints, find_maxima, find_maxima_in_strips
 from lightning_pose.features.surf.hessian import (
     LAYERS,
     OCTAVES,
@@ -147,6 +148,23 @@ def test_stages_work_on_batches(n: int) -> None:
             rtol=0,
         )
         np.testing.assert_allclose(one, descriptors[i], atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("shape", [(240, 320), (61, 700), (33, 40), (22, 22)])
+def test_strips_find_the_maxima_that_whole_planes_have(shape: tuple[int, int]) -> None:
+    integral = compute_integral_image(texture(*shape))
+    (_, *wanted), (_, *found) = find_maxima(integral, 0.5), find_maxima_in_strips(integral[0], 0.5)
+    count = int((wanted[2] > 0).sum())
+    assert count > 500 if shape == (240, 320) else count == found[0].shape[1]
+    assert all(torch.equal(a[:, :count], b) for a, b in zip(wanted, found, strict=True))
+
+
+def test_threads_do_not_share_memory() -> None:
+    surf, images = SURF(100), [texture(seed=seed) for seed in range(8)]
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(surf, images))
+    for image_, found in zip(images, together, strict=True):
+        assert all(torch.equal(a, b) for a, b in zip(surf(image_), found, strict=True))
 
 
 def test_a_few_are_a_prefix_of_many() -> None:
