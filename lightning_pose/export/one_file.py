@@ -74,12 +74,12 @@ def join_modules(roots: Iterable[str], replaced: Mapping[str, str], head: str, t
 
 
 class _Collector:
-    """The modules that are needed, in an order in which each comes after those that it uses."""
+    """The modules that are needed, and which others each of them uses."""
 
     def __init__(self, replaced: Mapping[str, str]) -> None:
         self.replaced = replaced
         self.modules: dict[str, Module] = {}
-        self.order: list[str] = []
+        self.uses: dict[str, list[str]] = {}
         self.imports: dict[str, tuple[str, str | None]] = {}
 
     def need(self, module: str, name: str) -> None:
@@ -100,8 +100,6 @@ class _Collector:
         for used in sorted(statement.annotated - statement.used):
             if self._can_have(found, used):
                 self._need_used(found, used)
-        if module not in self.order:
-            self.order.append(module)
 
     def _need_used(self, module: Module, name: str) -> None:
         """Take what a name means in a module; names of Python itself and of arguments mean nothing there."""
@@ -126,6 +124,7 @@ class _Collector:
         if dotted in self.replaced:
             source, original = self.replaced[dotted].rsplit(".", 1)
         if source.partition(".")[0] == PACKAGE and original is not None:
+            self.uses.setdefault(module.name, []).append(source)
             self.need(source, original)
         elif source.partition(".")[0] in {*sys.stdlib_module_names, *ALLOWED}:
             if self.imports.setdefault(name, (source, original)) != (source, original):
@@ -137,7 +136,7 @@ class _Collector:
         """The file."""
         parts = [f'"""{head}"""', "from __future__ import annotations", self._write_imports()]
         owner: dict[str, str] = {}
-        for name in self.order:
+        for name in self._sort_modules():
             module = self.modules[name]
             parts.append(_write_headline(module))
             for number in sorted(module.needed):
@@ -148,6 +147,23 @@ class _Collector:
         text = "\n\n".join([*parts, tail])
         text = re.sub(r"\n\n(?=(?:@|class |def |# -----))", "\n\n\n", SHAPED.sub("np.ndarray", text)) + "\n"
         return text.replace(CONTENTS, _list_contents(text))
+
+    def _sort_modules(self) -> list[str]:
+        """Names of the modules, each after those that it uses; of two that use each other, the first needed is last."""
+        found: dict[str, None] = {}
+        entered: set[str] = set()
+
+        def add(name: str) -> None:
+            if name not in entered:
+                entered.add(name)
+                for used in self.uses.get(name, ()):
+                    add(used)
+                if self.modules[name].needed:
+                    found[name] = None
+
+        for name in self.modules:
+            add(name)
+        return list(found)
 
     def _write_imports(self) -> str:
         lines, joined = [], {}

@@ -65,5 +65,7 @@ def test_a_package_that_is_not_there_is_named() -> None:
         join_modules(["lightning_pose.models.parts.ridge.Moments"], {}, "", "")
     with pytest.raises(ValueError, match="does not define nothing"):
         join_modules(["lightning_pose.errors.nothing"], {}, "", "")
-    with pytest.raises(ValueError, match="both define main; rename one"):
-        join_modules(["lightning_pose.commands.check.main", "lightning_pose.commands.synth.main"], {}, "", "")
+    with pytest.raises(ValueError, match="both define MIN_MATCHES; rename one"):
+        join_modules(
+            [f"lightning_pose.mapping.{name}.MIN_MATCHES" for name in ("frame_matches", "map_localizer")], {}, "", ""
+        )
