@@ -9,7 +9,7 @@ import pycolmap
 
 from lightning_pose.geometry.epipolar import essential_matrices, sampson_distances_px
 
-__all__ = ["MatchedPair", "count_agreeing", "drop_poor_frames"]
+__all__ = ["MatchedPair", "count_agreeing", "drop_poor_frames", "measure_span"]
 
 TOLERANCE_PX = 3.0
 """Sampson distance within which a match lies on its epipolar line."""
@@ -50,6 +50,17 @@ def drop_poor_frames(model: pycolmap.Reconstruction, pairs: Sequence[MatchedPair
     for number in poor:
         model.deregister_frame(model.image(number).frame_id)
     return poor
+
+
+def measure_span(model: pycolmap.Reconstruction) -> float:
+    """Extent of the camera centres, as a share of the median distance from them to the points."""
+    centres = np.array([model.image(number).projection_center() for number in model.reg_image_ids()])
+    points = np.array([point.xyz for point in model.points3D.values()])
+    if not len(points):
+        return 0.0
+    some = centres[:: max(len(centres) // 20, 1)]
+    distance = np.median([np.median(np.linalg.norm(points - centre, axis=1)) for centre in some])
+    return float(np.linalg.norm(np.ptp(centres, axis=0)) / distance)
 
 
 def _count_by_pair(model: pycolmap.Reconstruction, pairs: Sequence[MatchedPair]) -> np.ndarray:
