@@ -12,6 +12,7 @@ The data goes one way, and imports follow it:
 - `data`: Scene + features -> batches
 - `losses`, `metrics`, `models`: the architectures, one file each
 - `localization`: a checkpoint -> poses of images
+- `export`: a trained system -> a folder that runs without torch
 - `serving`: a localizer behind HTTP
 - `runs`, `figures`, `evaluation`: MLflow, and what every test ends with
 - `sweeps`, `studies`, `reports`: tuning, the thesis's figures, tables of finished runs

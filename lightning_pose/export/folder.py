@@ -31,8 +31,8 @@ __all__ = ["Exported", "export_system"]
 
 NETWORK_FILE = "model.onnx"
 
-REQUIREMENTS = """numpy>=2.0
-opencv-python-headless>=4.10  # or opencv-python, or their contrib versions
+REQUIREMENTS = """numpy>=2.1
+opencv-python-headless>=5.0  # 5.0: the release tried; opencv-python and the contrib versions do as well
 """
 
 

@@ -8,7 +8,6 @@ package that the file may not import. A module of the package may be replaced by
 from __future__ import annotations
 
 import ast
-import copy
 import re
 import sys
 from collections.abc import Iterable, Mapping
@@ -32,12 +31,16 @@ SHAPED = re.compile(r'Float\[np\.ndarray, "[^"]*"\]')
 
 @dataclass
 class Statement:
-    """One statement at the top of a module, with the comments above it and the text below that documents it."""
+    """One statement at the top of a module, with the comments above it and the text below that documents it.
+
+    `used` are names that it uses when it runs, and `at_once` those of them that must be defined above it.
+    """
 
     text: str
     defined: list[str]
     used: set[str]
     annotated: set[str]
+    at_once: set[str]
 
 
 @dataclass
@@ -74,12 +77,11 @@ def join_modules(roots: Iterable[str], replaced: Mapping[str, str], head: str, t
 
 
 class _Collector:
-    """The modules that are needed, and which others each of them uses."""
+    """The modules that are needed, and what is needed of them."""
 
     def __init__(self, replaced: Mapping[str, str]) -> None:
         self.replaced = replaced
         self.modules: dict[str, Module] = {}
-        self.uses: dict[str, list[str]] = {}
         self.imports: dict[str, tuple[str, str | None]] = {}
 
     def need(self, module: str, name: str) -> None:
@@ -98,8 +100,7 @@ class _Collector:
         for used in sorted(statement.used):
             self._need_used(found, used)
         for used in sorted(statement.annotated - statement.used):
-            if self._can_have(found, used):
-                self._need_used(found, used)
+            self._take_if_possible(found, used)
 
     def _need_used(self, module: Module, name: str) -> None:
         """Take what a name means in a module; names of Python itself and of arguments mean nothing there."""
@@ -108,23 +109,21 @@ class _Collector:
         elif name in module.imported:
             self._need_imported(module, name)
 
-    def _can_have(self, module: Module, name: str) -> bool:
-        """Whether a name of an annotation can be taken."""
-        trial = copy.deepcopy(self)
+    def _take_if_possible(self, module: Module, name: str) -> None:
+        """Take a name of an annotation with what it uses, or nothing of it."""
+        before = {each: set(self.modules[each].needed) for each in self.modules}, dict(self.imports)
         try:
-            trial._need_used(trial.modules[module.name], name)
+            self._need_used(module, name)
         except ValueError:
-            return False
-        return True
+            needed, self.imports = before
+            for each, found in self.modules.items():
+                found.needed = needed.get(each, set())
 
     def _need_imported(self, module: Module, name: str) -> None:
         """Take what a module imports under a name."""
-        source, original = module.imported[name]
+        source, original = self._resolve(module, name)
         dotted = source if original is None else f"{source}.{original}"
-        if dotted in self.replaced:
-            source, original = self.replaced[dotted].rsplit(".", 1)
         if source.partition(".")[0] == PACKAGE and original is not None:
-            self.uses.setdefault(module.name, []).append(source)
             self.need(source, original)
         elif source.partition(".")[0] in {*sys.stdlib_module_names, *ALLOWED}:
             if self.imports.setdefault(name, (source, original)) != (source, original):
@@ -132,11 +131,37 @@ class _Collector:
         else:
             raise ValueError(f"{module.name} needs {dotted}, which an exported folder does not have")
 
+    def _resolve(self, module: Module, name: str) -> tuple[str, str | None]:
+        """Where a name that a module imports comes from: what stands in for it, if something does."""
+        source, original = module.imported[name]
+        dotted = source if original is None else f"{source}.{original}"
+        if dotted not in self.replaced:
+            return source, original
+        source, _, original = self.replaced[dotted].rpartition(".")
+        return source, original
+
+    def _order_modules(self) -> list[str]:
+        """The modules, each after those whose names it uses while it is read."""
+        order: list[str] = []
+
+        def place(name: str) -> None:
+            if name in order or name not in self.modules:
+                return
+            module = self.modules[name]
+            at_once = {used for number in module.needed for used in module.statements[number].at_once}
+            for used in sorted(at_once & module.imported.keys()):
+                place(self._resolve(module, used)[0])
+            order.append(name)
+
+        for name in self.modules:
+            place(name)
+        return order
+
     def write(self, head: str, tail: str) -> str:
         """The file."""
         parts = [f'"""{head}"""', "from __future__ import annotations", self._write_imports()]
         owner: dict[str, str] = {}
-        for name in self._sort_modules():
+        for name in self._order_modules():
             module = self.modules[name]
             parts.append(_write_headline(module))
             for number in sorted(module.needed):
@@ -147,23 +172,6 @@ class _Collector:
         text = "\n\n".join([*parts, tail])
         text = re.sub(r"\n\n(?=(?:@|class |def |# -----))", "\n\n\n", SHAPED.sub("np.ndarray", text)) + "\n"
         return text.replace(CONTENTS, _list_contents(text))
-
-    def _sort_modules(self) -> list[str]:
-        """Names of the modules, each after those that it uses; of two that use each other, the first needed is last."""
-        found: dict[str, None] = {}
-        entered: set[str] = set()
-
-        def add(name: str) -> None:
-            if name not in entered:
-                entered.add(name)
-                for used in self.uses.get(name, ()):
-                    add(used)
-                if self.modules[name].needed:
-                    found[name] = None
-
-        for name in self.modules:
-            add(name)
-        return list(found)
 
     def _write_imports(self) -> str:
         lines, joined = [], {}
@@ -217,7 +225,7 @@ def _read_module(name: str) -> Module:
             defined = _list_defined(node)
             if "__all__" not in defined:
                 used, annotated = _list_used(node)
-                module.statements.append(Statement(text, defined, used, annotated))
+                module.statements.append(Statement(text, defined, used, annotated, _list_at_once(node)))
     return module
 
 
@@ -241,6 +249,21 @@ def _list_defined(node: ast.stmt) -> list[str]:
         return [node.name]
     targets = node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
     return [name.id for target in targets for name in ast.walk(target) if isinstance(name, ast.Name)]
+
+
+def _list_at_once(node: ast.stmt) -> set[str]:
+    """Names that are looked up while a statement is read: all but those in bodies of functions and in annotations."""
+    if isinstance(node, ast.FunctionDef):
+        parts = [*node.decorator_list, *node.args.defaults, *filter(None, node.args.kw_defaults)]
+    elif isinstance(node, ast.ClassDef):
+        parts = [*node.bases, *(keyword.value for keyword in node.keywords), *node.decorator_list]
+        return {each.id for part in parts for each in ast.walk(part) if isinstance(each, ast.Name)}.union(
+            *(_list_at_once(inner) for inner in node.body)
+        )
+    else:
+        value = getattr(node, "value", None)
+        parts = [] if value is None else [value]
+    return {each.id for part in parts for each in ast.walk(part) if isinstance(each, ast.Name)}
 
 
 def _list_used(node: ast.stmt) -> tuple[set[str], set[str]]:
