@@ -121,8 +121,6 @@ class MapBuilder:
         val = self._read_frames(("val",), camera) if len(self.datamodule.scene.splits["val"]) else None
         candidates = [adjusted, rolled, *([plain] if self.bundle_adjust == "auto" else [])]
         chosen = min(candidates, key=lambda mapped: _measure_errors(mapped, val))
-        if chosen is rolled:  # once more with new tracks
-            chosen = add_frames(rolled, frames, np.arange(len(frames)), [])
         self._adjusts = chosen is not plain
         self._adjusted = chosen if self._adjusts else None
         return chosen
