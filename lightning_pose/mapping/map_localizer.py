@@ -33,6 +33,10 @@ PRIOR = (0.5, 30.0)
 PRIOR_PX = 64.0
 """How far a keypoint may lie from where a prior puts its point."""
 
+SURE_INLIERS = 40
+MOST_PASSES = 3
+"""Guided passes; after each, fewer inliers than that are matched anew from the better pose."""
+
 KERNEL = (0.05, 5.0)
 """How far training frames lend their offset to an answer: in median depths of the map's points, and degrees."""
 
@@ -185,18 +189,21 @@ class MapLocalizer:
             return self._refuse(frame, f"weak geometry: no pose agrees with four of {len(rows)} matches")
         pose, mask = found
         sigma = SIGMA_PX / query.focal_px
-        start = self._refine(pose, self.map.points[matched[mask]], points[rows[mask]], 2 * sigma, steps=3)
-        pose, still = start.pose, remove_rolling(points, start.turn)
-        rows, matched, seen = self._matcher.match_guided(query, still, pose)
-        visible = len(seen)
-        if len(rows) < MIN_MATCHES:
-            return self._refuse(frame, f"too few guided matches: {len(rows)} of {visible} points in view", visible)
-        refined = self._refine(pose, self.map.points[matched], points[rows], sigma)
-        observed = remove_rolling(points[rows], refined.turn)
-        local = (self.map.points[matched] - refined.pose.position) @ refined.pose.rotation
-        projected = local[:, :2] / np.maximum(local[:, 2:], 1e-9)
-        inlier = np.linalg.norm(projected - observed, axis=1) * query.focal_px <= INLIER_PX
-        inliers = int(inlier.sum())
+        refined = self._refine(pose, self.map.points[matched[mask]], points[rows[mask]], 2 * sigma, steps=3)
+        for _ in range(MOST_PASSES):
+            still = remove_rolling(points, refined.turn)
+            rows, matched, seen = self._matcher.match_guided(query, still, refined.pose)
+            visible = len(seen)
+            if len(rows) < MIN_MATCHES:
+                return self._refuse(frame, f"too few guided matches: {len(rows)} of {visible} points in view", visible)
+            refined = self._refine(refined.pose, self.map.points[matched], points[rows], sigma)
+            observed = remove_rolling(points[rows], refined.turn)
+            local = (self.map.points[matched] - refined.pose.position) @ refined.pose.rotation
+            projected = local[:, :2] / np.maximum(local[:, 2:], 1e-9)
+            inlier = np.linalg.norm(projected - observed, axis=1) * query.focal_px <= INLIER_PX
+            inliers = int(inlier.sum())
+            if inliers >= SURE_INLIERS:
+                break
         reason = "" if inliers >= ACCEPT_INLIERS else f"too few guided inliers: {inliers} of {visible} points in view"
         return self._answer(refined, inliers, visible, reason, ShownPoints(seen, projected, observed, inlier))
 

@@ -127,8 +127,6 @@ class MapBuilder:
         else:
             best = int(np.argmin([_measure_error_left_out(each) for each in candidates]))
         chosen = candidates[best]
-        if chosen is rolled:  # once more with new tracks
-            chosen = add_frames(rolled, frames, np.arange(len(frames)), [])
         self._adjusts = chosen is not plain
         self._adjusted = chosen if self._adjusts else None
         return chosen
