@@ -77,14 +77,14 @@ def take_first_descriptor(sum_by_track: Callable) -> Callable:
     return sum_or_first
 
 
-def match_once(matcher: QueryMatcher, query: MapQuery, points: np.ndarray, pose: CameraPose):
+def match_once(matcher: QueryMatcher, query: MapQuery, points: np.ndarray, pose: CameraPose, *radius_px: float):
     """The matches that RANSAC agreed with, in place of those of the guided pass."""
     _, rows, matched = matcher.match_candidates(query.descriptors)
     local = (matcher.map.points[matched] - pose.position) @ pose.rotation
     with np.errstate(divide="ignore", invalid="ignore"):
         off = np.linalg.norm(local[:, :2] / local[:, 2:] - points[rows], axis=1) * query.focal_px
     near = (off <= map_localizer.RANSAC_PX) & (local[:, 2] > 0)
-    _, _, seen = MATCH_GUIDED(matcher, query, points, pose)
+    _, _, seen = MATCH_GUIDED(matcher, query, points, pose, *radius_px)
     return rows[near], matched[near], seen
 
 

@@ -18,7 +18,7 @@ __all__ = ["ViewRecorder"]
 LONGEST_PX, JPEG_QUALITY = 640, 80
 """Images in a recording are shrunk to this, because they are most of it."""
 
-GRAY, BLUE, RED, GREEN = (150, 150, 150), (0, 114, 178), (213, 94, 0), (0, 158, 115)
+GRAY, BLUE, GREEN = (150, 150, 150), (0, 114, 178), (0, 158, 115)
 
 FIELD_OF_VIEW = math.radians(60)
 """Across, of cameras that nobody knows; only the drawing depends on it."""
@@ -46,6 +46,7 @@ class ViewRecorder:
         self._rerun = rerun
         self._camera = camera
         self._count = 0
+        self._trajectory: list[np.ndarray] = []
         self._stream = rerun.RecordingStream("lightning_pose localize")
         try:
             self._stream.save(str(path))
@@ -63,30 +64,28 @@ class ViewRecorder:
         self._count += 1
         about = f"{pose.image}: {pose.status}, {pose.reason or f'radius {pose.radius_m:.3g}, {pose.inliers} inliers'}"
         stream.log("log", rerun.TextLog(about, level="INFO" if pose.accepted else "WARN"))
-        if not np.isfinite(pose.position_m).all():
-            return
-        color = BLUE if pose.accepted else RED
-        w, x, y, z = pose.quat_wxyz
-        stream.log(
-            "world/camera",
-            rerun.Transform3D(translation=pose.position_m, quaternion=rerun.Quaternion(xyzw=[x, y, z, w])),
-        )
-        stream.log(
-            f"world/{'accepted' if pose.accepted else 'refused'}/{self._count:06d}",
-            rerun.Points3D([pose.position_m], colors=color),
-        )
+        if pose.accepted:  # where it is refused, the camera stays where it was
+            self._trajectory.append(pose.position_m)
+            w, x, y, z = pose.quat_wxyz
+            stream.log(
+                "world/camera",
+                rerun.Transform3D(translation=pose.position_m, quaternion=rerun.Quaternion(xyzw=[x, y, z, w])),
+            )
         self._add_radius(pose)
         if pixels is not None:
             self._add_image(pose, pixels)
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write the whole trajectory, and what is left."""
+        if self._trajectory:
+            points = self._rerun.Points3D(self._trajectory, colors=BLUE)
+            self._stream.log("world/trajectory", points, static=True)
         self._stream.disconnect()
 
     def _add_radius(self, pose: LocatedPose) -> None:
         """The sphere that holds 90 % of errors."""
         rerun = self._rerun
-        if math.isfinite(pose.radius_m):
+        if pose.accepted and math.isfinite(pose.radius_m):
             sphere = rerun.Ellipsoids3D(centers=[pose.position_m], half_sizes=[[pose.radius_m] * 3], colors=GREEN)
             self._stream.log("world/radius", sphere)
         else:

@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from lightning_pose.geometry.absolute_pose import CameraPose
+from lightning_pose.geometry.rolling_shutter import remove_rolling
 from lightning_pose.geometry.triangulation import (
     find_midpoints,
     refine_points,
@@ -18,7 +19,7 @@ from lightning_pose.geometry.triangulation import (
 )
 from lightning_pose.mapping.bundle_adjustment import Adjustment, CameraCorrection, adjust_bundle
 from lightning_pose.mapping.depth_vote import vote_depths
-from lightning_pose.mapping.frames import MapFrames
+from lightning_pose.mapping.frames import MapFrames, find_turn_rates
 from lightning_pose.mapping.guided_matching import match_pairs
 from lightning_pose.mapping.pairs import FEW_FRAMES, choose_pairs, estimate_depth
 from lightning_pose.mapping.point_map import PointMap, quantize_descriptors
@@ -33,6 +34,7 @@ __all__ = [
     "adjust_mapped",
     "build_point_map",
     "map_frames",
+    "roll_mapped",
     "summarize_tracks",
     "triangulate_tracks",
 ]
@@ -102,6 +104,11 @@ class MappedFrames:
         """What was wrong with the assumed camera."""
         return CameraCorrection() if self.state is None else self.state.camera
 
+    @property
+    def readout(self) -> float:
+        """Of a rolling shutter, as `Adjustment` has it."""
+        return 0.0 if self.state is None else self.state.readout
+
 
 def build_point_map(frames: MapFrames, adjust: bool = False) -> PointMap:
     """The map of posed frames, by `map_frames`."""
@@ -129,6 +136,18 @@ def adjust_mapped(mapped: MappedFrames) -> MappedFrames:
             tracks = triangulate_tracks(seen, find_tracks(seen))
         state, seen, tracks = _adjust_once(state, given, tracks)
     return MappedFrames(given, seen, triangulate_tracks(seen, tracks), state)
+
+
+def roll_mapped(mapped: MappedFrames) -> MappedFrames:
+    """The same frames after one more bundle adjustment, for a rolling shutter; the tracks are the same.
+
+    Raises:
+        ValueError: `mapped` was not adjusted.
+    """
+    if mapped.state is None:
+        raise ValueError("the shutter is found after bundle adjustment")
+    state, seen, tracks = _adjust_once(replace(mapped.state, rolling=True), mapped.given, mapped.tracks)
+    return MappedFrames(mapped.given, seen, triangulate_tracks(seen, tracks), state)
 
 
 def add_frames(mapped: MappedFrames, given: MapFrames, rows: np.ndarray, others: Sequence[CameraPose]) -> MappedFrames:
@@ -167,7 +186,9 @@ def _adjust_once(state: Adjustment, given: MapFrames, tracks: Tracks) -> tuple[A
 
 def _move_frames(state: Adjustment, given: MapFrames) -> MapFrames:
     """The frames with the poses and keypoints of the map's own cameras."""
-    points = np.where(given.real[:, :, None], state.camera.remove(given.points), 0.0)
+    rolled = state.camera.remove(given.points)
+    still = remove_rolling(rolled, (state.readout * find_turn_rates(given.rotation))[:, None])
+    points = np.where(given.real[:, :, None], still, 0.0)
     return replace(given.with_poses(*state.camera_poses), points=points)
 
 
@@ -203,7 +224,8 @@ def _refine_in_parts(tracks: Tracks, columns: tuple[np.ndarray, ...]) -> np.ndar
 
     def refine(first: int, last: int) -> np.ndarray:
         rows = slice(*np.searchsorted(tracks.track, [first, last]))
-        return refine_points(tracks.points[first:last], tracks.track[rows] - first, *(each[rows] for each in columns))
+        centre, rotation, observed, huber = (each[rows] for each in columns)
+        return refine_points(tracks.points[first:last], tracks.track[rows] - first, centre, rotation, observed, huber)
 
     parts = map_in_threads(lambda ends: refine(*ends), pairwise([*starts.tolist(), len(tracks.points)]))
     return np.concatenate([tracks.points[:0], *parts])
@@ -231,7 +253,7 @@ def summarize_tracks(mapped: MappedFrames) -> PointMap:
         position=frames.position,
         given_rotation=given.rotation,
         given_position=given.position,
-        camera=np.array([camera.scale, *camera.centre, camera.k1]),
+        camera=np.array([camera.scale, *camera.centre, camera.k1, mapped.readout]),
     )
 
 

@@ -13,8 +13,9 @@ from scipy import sparse
 from scipy.sparse.linalg import LinearOperator, cg
 from scipy.spatial.transform import Rotation
 
+from lightning_pose.geometry.rolling_shutter import derive_rolling
 from lightning_pose.geometry.triangulation import sum_by_track
-from lightning_pose.mapping.frames import MapFrames
+from lightning_pose.mapping.frames import MapFrames, find_turn_rates
 
 __all__ = ["Adjustment", "CameraCorrection", "adjust_bundle"]
 
@@ -32,6 +33,9 @@ CAMERA_SD_PX = (5.0, 2.0)
 
 DISTORTION_SD = 0.02
 """Of the first radial coefficient."""
+
+READOUT_SD = 0.5
+"""Of the time that the rows in one unit of normalised image coordinates take, in intervals between frames."""
 
 STEPS = 6
 CG_STEPS = 15
@@ -79,6 +83,8 @@ class Adjustment:
         offset_rotation: (3, 3), from the camera's axes to those of the given poses; the same for all frames.
         offset_position: (3,), where the camera stands in the axes of the given poses.
         camera: what is wrong with the assumed camera.
+        rolling: whether the rows of an image are taken one after the other, while the camera turns.
+        readout: time that they take for one unit of normalised y, in intervals between frames; 0 if not `rolling`.
     """
 
     rotation: np.ndarray
@@ -87,6 +93,8 @@ class Adjustment:
     offset_rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
     offset_position: np.ndarray = field(default_factory=lambda: np.zeros(3))
     camera: CameraCorrection = CameraCorrection()
+    rolling: bool = False
+    readout: float = 0.0
 
     @property
     def camera_poses(self) -> tuple[np.ndarray, np.ndarray]:
@@ -136,6 +144,7 @@ class _Problem:
     ) -> None:
         self.given, self.track, self.frame = given, track, frame
         self.observed = given.points[frame, keypoint]
+        self.turn_rate = find_turn_rates(given.rotation)[frame][:, :, None] * start.rolling
         self.sigma = CAUCHY_PX / given.focal_px[frame]
         rotation, position = start.camera_poses
         local = np.einsum("oji,oj->oi", rotation[frame], start.points[track] - position[frame])
@@ -147,11 +156,11 @@ class _Problem:
             + [OFFSET_SD[1] * depth] * 3
             + [CAMERA_SD_PX[0] / focal_px]
             + [CAMERA_SD_PX[1] / focal_px] * 2
-            + [DISTORTION_SD]
+            + [DISTORTION_SD, READOUT_SD]
         )
 
     def prior_errors(self, state: Adjustment) -> tuple[np.ndarray, np.ndarray]:
-        """(F, 6) and (10,): what has moved from where it was given, not yet divided by standard deviations."""
+        """(F, 6) and (11,): what has moved from where it was given, not yet divided by standard deviations."""
         turned = Rotation.from_matrix(np.swapaxes(self.given.rotation, 1, 2) @ state.rotation).as_rotvec()
         shared = np.concatenate(
             [
@@ -159,7 +168,7 @@ class _Problem:
                 state.offset_position,
                 [state.camera.scale - 1],
                 state.camera.centre,
-                [state.camera.k1],
+                [state.camera.k1, state.readout],
             ]
         )
         return np.column_stack([turned, state.position - self.given.position]), shared
@@ -169,7 +178,12 @@ class _Problem:
         rotation, position = state.camera_poses
         local = np.einsum("oji,oj->oi", rotation[self.frame], state.points[self.track] - position[self.frame])
         ideal = local[:, :2] / np.maximum(local[:, 2:], 1e-9)
-        return state.camera.distort(ideal) - self.observed, local
+        rolled = ideal + state.readout * self.find_rolling(ideal)
+        return state.camera.distort(rolled) - self.observed, local
+
+    def find_rolling(self, ideal: np.ndarray) -> np.ndarray:
+        """(O, 2) by how much a rolling shutter whose readout is 1 moves (O, 2) points."""
+        return (derive_rolling(ideal) @ self.turn_rate)[:, :, 0]
 
     def cost(self, state: Adjustment) -> float:
         """Cauchy's cost of the image errors and the squares of the priors."""
@@ -193,7 +207,8 @@ class _Problem:
             (self.prior_errors(state), self.pose_sd, self.shared_sd),
             damping,
         )
-        return Adjustment(
+        return replace(
+            state,
             rotation=state.rotation @ Rotation.from_rotvec(move[:, :3]).as_matrix(),
             position=state.position + move[:, 3:],
             points=state.points + points,
@@ -205,10 +220,11 @@ class _Problem:
                 centre=state.camera.centre + shared[7:9],
                 k1=state.camera.k1 + float(shared[9]),
             ),
+            readout=state.readout + float(shared[10]),
         )
 
     def _derive(self, state: Adjustment, local: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Derivatives of the image errors: by pose (O, 2, 6), by what is shared (O, 2, 10), by point (O, 2, 3)."""
+        """Derivatives of the image errors: by pose (O, 2, 6), by what is shared (O, 2, 11), by point (O, 2, 3)."""
         z = np.maximum(local[:, 2], 1e-9)
         ideal = local[:, :2] / z[:, None]
         squared = (ideal**2).sum(axis=1)
@@ -234,6 +250,7 @@ class _Problem:
                 (ideal * (1 + camera.k1 * squared)[:, None])[:, :, None],
                 np.broadcast_to(np.eye(2), (len(z), 2, 2)),
                 (camera.scale * ideal * squared[:, None])[:, :, None],
+                self.find_rolling(ideal)[:, :, None],
             ],
             axis=2,
         )
@@ -250,7 +267,7 @@ def _solve_schur(
     """Solve the normal equations: conjugate gradients on poses and shared numbers, the points eliminated.
 
     Returns:
-        the steps of poses (F, 6), of what is shared (10,), and of points (T, 3).
+        the steps of poses (F, 6), of what is shared (11,), and of points (T, 3).
     """
     of_pose, of_shared, of_point = blocks
     frame, track, n_frames, n_points = sizes

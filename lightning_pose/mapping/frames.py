@@ -5,11 +5,30 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-__all__ = ["MapFrames", "MapQuery", "find_distance_scale"]
+__all__ = ["MapFrames", "MapQuery", "find_distance_scale", "find_turn_rates"]
 
 BINARY_SCALE = 2.0
 """Distance of two binary descriptors of one point by that of two SURF descriptors, for which thresholds are chosen."""
+
+MOST_TURN = 0.15
+"""Radians by which successive frames of a video may turn; 9 degrees."""
+
+
+def find_turn_rates(rotation: np.ndarray) -> np.ndarray:
+    """(F, 3) by how much each camera turns in its own axes from one frame to the next, radians.
+
+    Frames that are far from their neighbours are no successive frames of a video, and have zeros.
+
+    Args:
+        rotation: (F, 3, 3), camera-to-world, frame after frame.
+    """
+    turn = Rotation.from_matrix(np.swapaxes(rotation[:-1], 1, 2) @ rotation[1:]).as_rotvec()
+    near = np.linalg.norm(turn, axis=1, keepdims=True) <= MOST_TURN
+    sides = np.pad(np.where(near, turn, 0.0), ((1, 1), (0, 0)))
+    count = np.pad(near.astype(float), ((1, 1), (0, 0)))
+    return (sides[:-1] + sides[1:]) / np.maximum(count[:-1] + count[1:], 1)
 
 
 def find_distance_scale(descriptors: np.ndarray) -> float:

@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lightning_pose.geometry.absolute_pose import CameraPose, RefinedPose, find_pose_ransac, refine_pose
+from lightning_pose.geometry.absolute_pose import CameraPose, find_pose_ransac, refine_pose
+from lightning_pose.geometry.rolling_shutter import TurningPose, refine_turning_pose, remove_rolling
 from lightning_pose.mapping.frames import MapQuery
 from lightning_pose.mapping.point_map import PointMap
 from lightning_pose.mapping.query_matching import QueryMatcher
@@ -32,8 +33,15 @@ PRIOR = (0.5, 30.0)
 PRIOR_PX = 64.0
 """How far a keypoint may lie from where a prior puts its point."""
 
+SURE_INLIERS = 40
+MOST_PASSES = 3
+"""Guided passes; after each, fewer inliers than that are matched anew from the better pose."""
+
 KERNEL = (0.05, 5.0)
 """How far training frames lend their offset to an answer: in median depths of the map's points, and degrees."""
+
+AROUND = 15
+"""Frames before and after each over which the drift of the given poses hardly changes, while the camera's turn does."""
 
 
 class ShownPoints(NamedTuple):
@@ -105,6 +113,14 @@ class MapLocalizer:
         moved = point_map.given_position[self._kept] - point_map.position[self._kept]
         self._move_back = np.einsum("fij,fj->fi", back, moved)
         self._adjusted = bool(np.abs(self._turn_back).max() > 1e-12 or np.abs(self._move_back).max() > 1e-12)
+        turns = point_map.turns[self._kept]
+        self._turn_sd = float(np.sqrt((turns**2).mean()))
+        self._by_turn = np.zeros((3, 6))
+        if self._turn_sd > 0:
+            moved_back = np.concatenate([self._turn_back, self._move_back], axis=1)
+            self._by_turn = np.linalg.lstsq(_subtract_mean(turns), _subtract_mean(moved_back), rcond=None)[0]
+            self._turn_back = self._turn_back - turns @ self._by_turn[:, :3]
+            self._move_back = self._move_back - turns @ self._by_turn[:, 3:]
         frame, point = point_map.seen_frame, point_map.seen_point
         distance = np.linalg.norm(point_map.points[point] - point_map.position[frame], axis=1)
         self._depth = float(np.median(distance)) if len(distance) else 1.0
@@ -173,24 +189,37 @@ class MapLocalizer:
             return self._refuse(frame, f"weak geometry: no pose agrees with four of {len(rows)} matches")
         pose, mask = found
         sigma = SIGMA_PX / query.focal_px
-        pose = refine_pose(pose, self.map.points[matched[mask]], points[rows[mask]], 2 * sigma, steps=3).pose
-        rows, matched, seen = self._matcher.match_guided(query, points, pose)
-        visible = len(seen)
-        if len(rows) < MIN_MATCHES:
-            return self._refuse(frame, f"too few guided matches: {len(rows)} of {visible} points in view", visible)
-        refined = refine_pose(pose, self.map.points[matched], points[rows], sigma)
-        local = (self.map.points[matched] - refined.pose.position) @ refined.pose.rotation
-        projected = local[:, :2] / np.maximum(local[:, 2:], 1e-9)
-        inlier = np.linalg.norm(projected - points[rows], axis=1) * query.focal_px <= INLIER_PX
-        inliers = int(inlier.sum())
+        refined = self._refine(pose, self.map.points[matched[mask]], points[rows[mask]], 2 * sigma, steps=3)
+        for _ in range(MOST_PASSES):
+            still = remove_rolling(points, refined.turn)
+            rows, matched, seen = self._matcher.match_guided(query, still, refined.pose)
+            visible = len(seen)
+            if len(rows) < MIN_MATCHES:
+                return self._refuse(frame, f"too few guided matches: {len(rows)} of {visible} points in view", visible)
+            refined = self._refine(refined.pose, self.map.points[matched], points[rows], sigma)
+            observed = remove_rolling(points[rows], refined.turn)
+            local = (self.map.points[matched] - refined.pose.position) @ refined.pose.rotation
+            projected = local[:, :2] / np.maximum(local[:, 2:], 1e-9)
+            inlier = np.linalg.norm(projected - observed, axis=1) * query.focal_px <= INLIER_PX
+            inliers = int(inlier.sum())
+            if inliers >= SURE_INLIERS:
+                break
         reason = "" if inliers >= ACCEPT_INLIERS else f"too few guided inliers: {inliers} of {visible} points in view"
-        return self._answer(refined, inliers, visible, reason, ShownPoints(seen, projected, points[rows], inlier))
+        return self._answer(refined, inliers, visible, reason, ShownPoints(seen, projected, observed, inlier))
 
-    def _answer(self, refined: RefinedPose, inliers: int, visible: int, reason: str, shown: ShownPoints) -> MapAnswer:
+    def _refine(
+        self, pose: CameraPose, points: np.ndarray, observed: np.ndarray, sigma: float, steps: int = 8
+    ) -> TurningPose:
+        """The pose that fits points (N, 3) seen at (N, 2) best, and how the camera turned if the map's did."""
+        if self._turn_sd > 0:
+            return refine_turning_pose(pose, points, observed, sigma, self._turn_sd, steps)
+        return TurningPose(*refine_pose(pose, points, observed, sigma, steps), np.zeros(3))
+
+    def _answer(self, refined: TurningPose, inliers: int, visible: int, reason: str, shown: ShownPoints) -> MapAnswer:
         covariance = np.linalg.pinv(refined.normal, hermitian=True)
         spread = np.maximum(np.diag(covariance), 0.0)
         return MapAnswer(
-            self.carry_back(refined.pose),
+            self.carry_back(refined.pose, refined.turn),
             refined.pose,
             inliers,
             visible,
@@ -206,33 +235,43 @@ class MapLocalizer:
         given = CameraPose(self.map.given_rotation[frame], self.map.given_position[frame])
         return MapAnswer(given, CameraPose(self.map.rotation[frame], self.map.position[frame]), 0, visible, reason)
 
-    def carry_back(self, pose: CameraPose) -> CameraPose:
+    def carry_back(self, pose: CameraPose, turn: np.ndarray | None = None) -> CameraPose:
         """The pose that the dataset would give a camera at `pose` of the map: by what near training frames were moved.
 
         The offset of an answer is the mean of theirs, in the axes of the camera, weighted by a Gaussian of their
-        distance and angle to it.
+        distance and angle to it. What depends on how the camera `turn`ed (3,), because the clocks of images and poses
+        differ or because the given poses take the shutter for a global one, is a linear function of it.
         """
         if not self._adjusted:
             return pose
-        turn, move = self._mean_offset(pose, self.map.rotation, self.map.position)
-        return CameraPose(pose.rotation @ turn, pose.position + pose.rotation @ move)
+        offset = self._mean_offset(pose, self.map.rotation, self.map.position)
+        if turn is not None:
+            offset = offset + turn @ self._by_turn
+        back = Rotation.from_rotvec(offset[:3]).as_matrix()
+        return CameraPose(pose.rotation @ back, pose.position + pose.rotation @ offset[3:])
 
     def carry_forward(self, pose: CameraPose) -> CameraPose:
         """Where the map would put a camera at a pose that the dataset gives: the other way round."""
         if not self._adjusted:
             return pose
-        turn, move = self._mean_offset(pose, self.map.given_rotation, self.map.given_position)
-        rotation = pose.rotation @ turn.T
-        return CameraPose(rotation, pose.position - rotation @ move)
+        offset = self._mean_offset(pose, self.map.given_rotation, self.map.given_position)
+        rotation = pose.rotation @ Rotation.from_rotvec(-offset[:3]).as_matrix()
+        return CameraPose(rotation, pose.position - rotation @ offset[3:])
 
-    def _mean_offset(
-        self, pose: CameraPose, rotation: np.ndarray, position: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Rotation (3, 3) and movement (3,), in a camera's axes, from the map to given poses, of near frames."""
+    def _mean_offset(self, pose: CameraPose, rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
+        """(6,) rotation vector and movement, in a camera's axes, from the map to given poses, of near frames."""
         away = np.linalg.norm(position[self._kept] - pose.position, axis=1) / self._kernel
         cosine = (np.einsum("fij,ij->f", rotation[self._kept], pose.rotation) - 1) / 2
         turned = np.degrees(np.arccos(np.clip(cosine, -1, 1))) / KERNEL[1]
         squared = away**2 + turned**2
         weight = np.exp(-0.5 * (squared - squared.min()))
         weight /= weight.sum()
-        return Rotation.from_rotvec(weight @ self._turn_back).as_matrix(), weight @ self._move_back
+        return np.concatenate([weight @ self._turn_back, weight @ self._move_back])
+
+
+def _subtract_mean(values: np.ndarray) -> np.ndarray:
+    """(F, K) less their mean over the frames around each: what drifts slowly is gone."""
+    total = np.cumsum(np.pad(values, ((1, 0), (0, 0))), axis=0)
+    frame = np.arange(len(values))
+    first, last = np.maximum(frame - AROUND, 0), np.minimum(frame + AROUND + 1, len(values))
+    return values - (total[last] - total[first]) / (last - first)[:, None]

@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from lightning_pose.mapping.bundle_adjustment import CameraCorrection
+from lightning_pose.mapping.frames import find_turn_rates
 
 __all__ = ["PointMap", "quantize_descriptors"]
 
@@ -31,7 +32,8 @@ class PointMap:
         position: (F, 3) float64.
         given_rotation: (F, 3, 3) float64, as the dataset has it; the same if no pose was adjusted.
         given_position: (F, 3) float64.
-        camera: (4,) float64: scale, centre x and y, and k1 of the `CameraCorrection`.
+        camera: (5,) float64: scale, centre x and y, and k1 of the `CameraCorrection`, and `Adjustment.readout` (not
+            in older maps).
     """
 
     points: np.ndarray
@@ -58,8 +60,14 @@ class PointMap:
     @property
     def camera_correction(self) -> CameraCorrection:
         """What was wrong with the assumed camera."""
-        scale, x, y, k1 = self.camera.tolist()
+        scale, x, y, k1 = self.camera[:4].tolist()
         return CameraCorrection(scale, np.array([x, y]), k1)
+
+    @property
+    def turns(self) -> np.ndarray:
+        """(F, 3) by how much each camera turned while its rows were read, as `refine_turning_pose` takes it."""
+        readout = float(self.camera[4]) if len(self.camera) > 4 else 0.0
+        return readout * find_turn_rates(self.rotation)
 
     @property
     def seen_frame(self) -> np.ndarray:

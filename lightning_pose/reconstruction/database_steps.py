@@ -19,6 +19,7 @@ from lightning_pose.scenes.images import read_gray
 
 __all__ = ["extract_all", "match_all"]
 
+Cameras = tuple[pycolmap.Camera, pycolmap.Camera]
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
@@ -50,9 +51,7 @@ def match_all(
     read_camera = lru_cache(maxsize=None)(database.read_camera)
     tasks = ((a, b, read_features(a), read_features(b), (read_camera(a), read_camera(b))) for a, b in missing)
 
-    def compute(
-        task: tuple[int, int, Features, Features, tuple[pycolmap.Camera, pycolmap.Camera]],
-    ) -> tuple[int, int, pycolmap.TwoViewGeometry]:
+    def compute(task: tuple[int, int, Features, Features, Cameras]) -> tuple[int, int, pycolmap.TwoViewGeometry]:
         a, b, first, second, cameras = task
         return a, b, verify_pair(first, second, cameras)
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from lightning_pose.reconstruction.matches import MIN_MATCHES
 
-__all__ = ["PairFacts", "describe_rows", "diagnose", "find_components"]
+__all__ = ["PairFacts", "describe_parallax", "describe_rows", "diagnose", "find_components"]
 
 FEW_KEYPOINTS = 100
 
@@ -17,6 +17,14 @@ TURNED = (5, 6)
 """`TwoViewGeometryConfiguration` of a camera that only turned, and of one that turned or sees a plane."""
 
 CAPTURE = "move sideways while you film, slowly, and let each place be seen from several sides"
+
+
+TURNED_SHARE = 0.9
+"""Where more of the pairs are of a camera that only turned, poses of cameras close together are not to be believed."""
+
+PANORAMA_SPAN, SHORT_SPAN = 0.2, 0.15
+"""Distance between cameras, as a share of the distance to what they see: 0.11 of a camera that only turned, for which
+the mapper invents places, and 0.3 or more of usual videos."""
 
 
 class PairFacts(NamedTuple):
@@ -36,9 +44,8 @@ def describe_rows(rows: Iterable[int], names: Sequence[str]) -> str:
     """
     ordered = np.array(sorted(rows), int)
     runs = np.split(ordered, np.flatnonzero(np.diff(ordered) > 1) + 1) if len(ordered) else []
-    texts: list[str] = [
-        str(names[run[0]]) if len(run) == 1 else f"{names[run[0]]} to {names[run[-1]]} ({len(run)})" for run in runs[:6]
-    ]
+    ends = [(names[int(run[0])], names[int(run[-1])], len(run)) for run in runs[:6]]
+    texts = [first if count == 1 else f"{first} to {last} ({count})" for first, last, count in ends]
     more = [f"and {len(runs) - 6} more stretches"] if len(runs) > 6 else []
     return ", ".join([*texts, *more])
 
@@ -59,6 +66,27 @@ def find_components(pairs: Iterable[PairFacts], n: int) -> list[list[int]]:
     for i in range(n):
         members.setdefault(root(i), []).append(i)
     return sorted(members.values(), key=lambda rows: (-len(rows), rows[0]))
+
+
+def describe_parallax(pairs: Sequence[PairFacts], span: float) -> tuple[str, bool]:
+    """What is wrong with a scene whose cameras are close together, and whether its poses are worthless.
+
+    Args:
+        pairs: the verified pairs.
+        span: extent of the camera centres, as a share of the median distance to the points.
+
+    Returns:
+        the text, empty if the cameras are far enough apart, and whether to refuse the scene.
+    """
+    turned = sum(pair.kind in TURNED for pair in pairs)
+    if turned > TURNED_SHARE * len(pairs) and span < PANORAMA_SPAN:
+        return (
+            f"too little parallax: in {turned} of {len(pairs)} matching pairs the camera only turned; {CAPTURE}",
+            True,
+        )
+    if span < SHORT_SPAN:
+        return f"little parallax: the cameras span {span:.0%} of the distance to what they see; {CAPTURE}", False
+    return "", False
 
 
 def diagnose(

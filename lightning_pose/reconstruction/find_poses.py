@@ -14,7 +14,7 @@ from lightning_pose.reconstruction.pieces import join_pieces, polish
 from lightning_pose.reconstruction.progress import StepProgress
 from lightning_pose.reconstruction.workspace import Workspace
 
-__all__ = ["add_frames", "find_poses"]
+__all__ = ["add_frames", "find_poses", "read_pairs"]
 
 FEW_FRAMES = 60
 """Up to so many frames the incremental mapper is tried first: it is quick then, and seldom wrong."""

@@ -13,12 +13,13 @@ from threadpoolctl import threadpool_limits
 
 from lightning_pose.errors import DataError
 from lightning_pose.geometry.camera import Camera
+from lightning_pose.reconstruction.agreement import drop_poor_frames, measure_span
 from lightning_pose.reconstruction.alignment import find_frame
 from lightning_pose.reconstruction.cameras import list_cameras
 from lightning_pose.reconstruction.database import open_database
 from lightning_pose.reconstruction.database_steps import extract_all, match_all
-from lightning_pose.reconstruction.diagnosis import PairFacts, diagnose
-from lightning_pose.reconstruction.find_poses import add_frames, find_poses
+from lightning_pose.reconstruction.diagnosis import PairFacts, describe_parallax, diagnose
+from lightning_pose.reconstruction.find_poses import add_frames, find_poses, read_pairs
 from lightning_pose.reconstruction.frame_choice import choose_frames, measure_frames
 from lightning_pose.reconstruction.pairs import choose_pairs, describe_frames
 from lightning_pose.reconstruction.progress import StepProgress
@@ -45,7 +46,7 @@ class PosedFrames:
         names: of all chosen frames, below the folder of images.
         model: pycolmap's; image number = row + 1.
         posed: rows of the frames that have a pose in it.
-        reasons: why others have none.
+        reasons: what is wrong: why others have none, and whether the cameras are too close together.
     """
 
     names: tuple[str, ...]
@@ -88,7 +89,11 @@ def reconstruct(
         facts = [PairFacts(a, b, len(rows), kind) for a, b, rows, kind in database.list_pairs()]
     posed = () if model is None else tuple(sorted(number - 1 for number in model.reg_image_ids()))
     reasons = diagnose(names, counts, facts, posed)
-    if model is None or len(posed) < MIN_POSED:
+    failed = model is None or len(posed) < MIN_POSED
+    if model is not None and not failed:
+        text, failed = describe_parallax(facts, measure_span(model))
+        reasons = [text, *reasons] if text else reasons
+    if model is None or failed:
         raise DataError(f"no poses were found for the {len(names)} frames of {source.path}: {'; '.join(reasons)}")
     return PosedFrames(tuple(names), model, posed, tuple(reasons))
 
@@ -108,8 +113,8 @@ def choose_and_write(
         count = len(measures.motion)
         every = 1 if every is None and not source.is_video and count <= FEW_PHOTOS else every
         kept = {"chosen": choose_frames(measures, every).tolist(), "count": count}
-    every_name = source.list_names(kept["count"])
-    rows = {row for name in wanted if (row := find_frame(name, every_name)) is not None}
+    names = source.list_names(kept["count"])
+    rows = {row for row in (find_frame(name, names) for name in wanted) if row is not None}
     if not rows <= set(kept["chosen"]):
         workspace.clear_results()  # of fewer frames
         kept["chosen"] = sorted(rows.union(kept["chosen"]))
@@ -140,11 +145,13 @@ def _find_model(
     model = find_poses(workspace, len(paths), threads, fixed, progress)
     if model is None:
         return None
+    drop_poor_frames(model, read_pairs(workspace.database))
     left = set(range(len(paths))) - {number - 1 for number in model.reg_image_ids()}
     if left:
         with open_database(workspace.database) as database, threadpool_limits(1):
             again = [pair for pair in choose_pairs(vectors, SECOND_ALIKE) if set(pair) & left]
             match_all(database, again, threads, "matching frames without a pose", progress)
         model = add_frames(workspace, model, threads, fixed, progress)
+        drop_poor_frames(model, read_pairs(workspace.database))
     workspace.keep_model(model)
     return model

@@ -31,7 +31,7 @@ class Summary:
         residuals_m: how far known positions are off after the alignment, by image.
         seconds: how long each step of this call took.
         without_pose: frames without a pose, in words.
-        reasons: why they have none.
+        reasons: why they have none, and what else is wrong.
     """
 
     unit: str
@@ -64,7 +64,8 @@ class Summary:
         if self.unit != "m":
             lines.append('the unit of length is arbitrary; --scale "A B METRES" or --align makes it metres')
         if self.without_pose:
-            lines += [f"warning: without a pose: {self.without_pose}", *(f"warning: {text}" for text in self.reasons)]
+            lines.append(f"warning: without a pose: {self.without_pose}")
+        lines += [f"warning: {text}" for text in self.reasons]
         return lines
 
 

@@ -11,9 +11,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from lightning_pose.__main__ import main
 from lightning_pose.scenes.formats import load_scene
+from lightning_pose.scenes.images import read_rgb
 from lightning_pose.scenes.scene import Frame, Scene
 from lightning_pose.scenes.synthetic import render_room
 
@@ -127,6 +129,20 @@ def test_frames_of_several_places_have_no_poses(tmp_path: Path, capsys: pytest.C
         cv2.imwrite(str(photos / f"{i}.png"), noise)
     line = refuse(capsys, photos, tmp_path / "out")
     assert line.startswith(f"no poses were found for the 4 frames of {photos}: too few matches: 4 frames share 15")
+
+
+def test_a_camera_that_only_turns_is_refused(tmp_path: Path, photos: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    photo = cv2.resize(read_rgb(photos / "0.png"), None, fx=3, fy=3, interpolation=cv2.INTER_CUBIC)
+    before, after = np.diag([800.0, 800, 1]), np.diag([300.0, 300, 1])
+    before[:2, 2], after[:2, 2] = (480, 360), (160, 120)
+    (tmp_path / "photos").mkdir()
+    for i in range(6):
+        turn = Rotation.from_euler("yx", [4 * i - 10, 2 * np.sin(i)], degrees=True).as_matrix()
+        view = cv2.warpPerspective(photo, after @ turn @ np.linalg.inv(before), (320, 240))
+        cv2.imwrite(str(tmp_path / "photos" / f"{i}.png"), view)
+    line = refuse(capsys, tmp_path / "photos", tmp_path / "out")
+    assert "too little parallax" in line
+    assert "move sideways while you film" in line
 
 
 def test_without_pycolmap_the_remedy_is_named(

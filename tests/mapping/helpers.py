@@ -15,13 +15,15 @@ POINTS = 400
 DESCRIPTOR = 32
 
 
-def make_walk(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def make_walk(count: int, seed: int = 0, noise_deg: float = 0.5) -> tuple[np.ndarray, np.ndarray]:
     """Camera-to-world rotations (F, 3, 3) and positions (F, 3) in metres: along a wall 3 m away, looking at it."""
     rng = np.random.default_rng(seed)
     along = np.linspace(-1.5, 1.5, count)
     position_m = np.column_stack([along, 0.1 * np.sin(3 * along), 0.2 * np.cos(2 * along)])
     angles = np.column_stack([2 * np.sin(5 * along), 10 * np.sin(2 * along), 3 * np.cos(4 * along)])
-    return Rotation.from_euler("xyz", angles + rng.normal(0, 0.5, (count, 3)), degrees=True).as_matrix(), position_m
+    return Rotation.from_euler(
+        "xyz", angles + rng.normal(0, noise_deg, (count, 3)), degrees=True
+    ).as_matrix(), position_m
 
 
 def make_frames(

@@ -170,6 +170,23 @@ def test_carrying_back_returns_what_the_dataset_gives(training: MapFrames) -> No
     np.testing.assert_allclose(there.position, pose.position, atol=1e-9)
 
 
+def test_an_offset_of_the_clocks_is_carried_back_by_how_the_camera_turns(training: MapFrames) -> None:
+    point_map = replace(build_point_map(training), camera=np.array([1.0, 0, 0, 0, 0.5]))
+    turns = point_map.turns
+    late = replace(point_map, given_rotation=point_map.rotation @ Rotation.from_rotvec(0.4 * turns).as_matrix())
+    pose, turn = CameraPose(point_map.rotation[20], point_map.position[20]), np.array([0.02, -0.03, 0.01])
+    carried = MapLocalizer(late).carry_back(pose, turn)
+    still = MapLocalizer(late).carry_back(pose)
+    np.testing.assert_allclose(
+        Rotation.from_matrix(still.rotation.T @ carried.rotation).as_rotvec(), 0.4 * turn, atol=1e-3
+    )
+
+
+def test_a_map_of_an_older_file_has_a_global_shutter(training: MapFrames) -> None:
+    point_map = build_point_map(training)
+    assert not replace(point_map, camera=point_map.camera[:4]).turns.any()
+
+
 def test_added_frames_stand_where_a_new_adjustment_would_put_them(training: MapFrames) -> None:
     rng = np.random.default_rng(0)
     given = training.with_poses(training.rotation, training.position + rng.normal(0, 0.01, (60, 3)))

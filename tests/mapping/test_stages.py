@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from lightning_pose.geometry.rolling_shutter import derive_rolling
 from lightning_pose.mapping.bundle_adjustment import Adjustment, CameraCorrection, adjust_bundle
 from lightning_pose.mapping.depth_vote import vote_depths
-from lightning_pose.mapping.frames import find_distance_scale
+from lightning_pose.mapping.frames import find_distance_scale, find_turn_rates
 from lightning_pose.mapping.guided_matching import KeypointMatches, match_pairs
 from lightning_pose.mapping.pairs import choose_pairs, estimate_depth
 from lightning_pose.mapping.point_map import quantize_descriptors
@@ -146,6 +147,27 @@ def test_bundle_adjustment_finds_perturbed_poses_and_the_camera() -> None:
     assert np.median(error) < 0.05, "images agree to a twentieth of a pixel"
     # All cameras may turn by a common angle, which the principal point makes up for: compare frames with each other.
     assert _median_turn(rotation, camera_rotation) < 0.2 * _median_turn(rotation, given.rotation)
+
+
+def test_bundle_adjustment_finds_the_readout_of_a_rolling_shutter() -> None:
+    rotation, position_m = make_walk(40, noise_deg=0.0)
+    points_m = np.random.default_rng(1).uniform([-3, -1.5, 2.5], [3, 1.5, 4], (150, 3))
+    local = np.einsum("fji,ftj->fti", rotation, points_m[None] - position_m[:, None])
+    still = local[..., :2] / local[..., 2:]
+    rates = find_turn_rates(rotation)
+    seen = np.stack([view + derive_rolling(view) @ (0.6 * rate) for view, rate in zip(still, rates, strict=True)])
+    given = replace(make_frames(rotation, position_m), points=seen)
+    track, frame = np.repeat(np.arange(150), 40), np.tile(np.arange(40), 150)
+    start = Adjustment(rotation, position_m, points_m, rolling=True)
+    assert adjust_bundle(start, given, track, frame, track).readout == pytest.approx(0.6, abs=0.05)
+    assert adjust_bundle(replace(start, rolling=False), given, track, frame, track).readout == 0
+
+
+def test_turn_rates_do_not_reach_over_gaps() -> None:
+    angles = np.array([0.0, 0.02, 0.04, 0.08, 1.0, 1.1])
+    rates = find_turn_rates(Rotation.from_rotvec(np.outer(angles, [0, 1, 0])).as_matrix())
+    np.testing.assert_allclose(rates[:, 1], [0.02, 0.02, 0.03, 0.04, 0.1, 0.1])
+    assert find_turn_rates(np.eye(3)[None]).tolist() == [[0, 0, 0]]
 
 
 def _median_turn(true: np.ndarray, found: np.ndarray) -> float:

@@ -6,7 +6,13 @@ from itertools import pairwise
 
 import numpy as np
 
-from lightning_pose.reconstruction.diagnosis import PairFacts, describe_rows, diagnose, find_components
+from lightning_pose.reconstruction.diagnosis import (
+    PairFacts,
+    describe_parallax,
+    describe_rows,
+    diagnose,
+    find_components,
+)
 
 NAMES = [f"{i}.jpg" for i in range(8)]
 RICH = np.full(8, 500)
@@ -51,3 +57,15 @@ def test_components_and_runs() -> None:
     assert describe_rows(range(0, 8, 1), NAMES) == "0.jpg to 7.jpg (8)"
     many = [f"{i}" for i in range(100)]
     assert describe_rows(range(0, 100, 2), many) == "0, 2, 4, 6, 8, 10, and 44 more stretches"
+
+
+def test_cameras_that_are_close_together() -> None:
+    turning, moving = chain(*range(8), kind=6), chain(*range(8))
+    text, refused = describe_parallax(turning, 0.11)
+    assert text.startswith("too little parallax: in 7 of 7 matching pairs the camera only turned")
+    assert refused
+    assert describe_parallax(turning, 1.0) == ("", False)  # a wall, seen from several places
+    text, refused = describe_parallax(moving, 0.1)
+    assert text.startswith("little parallax: the cameras span 10% of the distance to what they see")
+    assert not refused
+    assert describe_parallax(moving, 0.3) == ("", False)

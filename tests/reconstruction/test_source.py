@@ -10,7 +10,7 @@ import pytest
 
 from lightning_pose.errors import DataError
 from lightning_pose.reconstruction.source import open_source
-from lightning_pose.scenes.images import read_rgb
+from lightning_pose.scenes.images import read_gray
 from tests.data.helpers import make_image
 from tests.scenes.formats.test_trajectory import write_video
 
@@ -37,7 +37,7 @@ def test_frames_of_a_video_are_written_once(tmp_path: Path) -> None:
     (out / "frame_000001.jpg").write_bytes(b"kept")
     assert list(source.write([1, 2, 4], out)) == ["frame_000001.jpg", "frame_000002.jpg", "frame_000004.jpg"]
     assert (out / "frame_000001.jpg").read_bytes() == b"kept"
-    np.testing.assert_allclose([np.mean(read_rgb(out / f"frame_00000{i}.jpg")) for i in (2, 4)], [60, 100], atol=4)
+    np.testing.assert_allclose([read_gray(out / f"frame_00000{i}.jpg").mean() for i in (2, 4)], [60, 100], atol=4)
 
 
 def test_what_is_no_source(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from lightning import Trainer
 
+from lightning_pose.__main__ import main
 from lightning_pose.data import ImageDataModule
 from lightning_pose.errors import ConfigError
 from lightning_pose.features import SURF
@@ -18,6 +19,7 @@ from lightning_pose.scenes.scene import Frame
 from lightning_pose.scenes.synthetic import render_room
 from lightning_pose.serving.load_service import load_service
 from lightning_pose.serving.service import Service
+from lightning_pose.serving.uploads import Upload
 from tests.serving.helpers import serve
 
 
@@ -86,6 +88,21 @@ def test_answers_are_the_localizer_s(service: Service, room: Room) -> None:
         assert answer.json["status"] == expected.status
     np.testing.assert_allclose(alone.json["position_m"], expected.position_m)
     assert alone.json["inliers"] == expected.inliers
+
+
+def test_an_exported_folder_is_served_as_its_checkpoint(service: Service, room: Room, tmp_path: Path) -> None:
+    assert main(["export", str(room.checkpoint), "--out", str(tmp_path / "hall")]) == 0
+    exported = load_service(tmp_path / "hall")
+    for name in ("architecture", "camera", "reads", "ground_truth", "version"):
+        assert exported.model[name] == service.model[name]
+    assert exported.view is not None
+    assert service.view is not None
+    for name in ("points", "cameras", "box"):
+        np.testing.assert_allclose(np.array(exported.view[name]), np.array(service.view[name]), atol=1e-3)
+    upload = Upload(room.frame.image.read_bytes(), "a.png")
+    answer, expected = exported.locate(upload), service.locate(upload)
+    np.testing.assert_allclose(np.array(answer["position_m"]), np.array(expected["position_m"]), atol=1e-3)
+    assert answer["image"] == "a.png"
 
 
 def test_systems_for_clips_are_refused(monkeypatch: pytest.MonkeyPatch, room: Room) -> None:

@@ -1,4 +1,4 @@
-"""SURF (Bay et al., 2008) in batched torch: `hessian` and `detector` find keypoints, `descriptor` describes them."""
+"""SURF (Bay et al., 2008): `hessian`, on a CPU `strips`, and `detector` find keypoints, `descriptor` describes them."""
 
 from lightning_pose.features.surf.extractor import SURF
 

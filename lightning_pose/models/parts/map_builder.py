@@ -14,8 +14,15 @@ from lightning_pose.errors import ConfigError, DataError
 from lightning_pose.features.base import FeatureExtractor, LocalExtractor
 from lightning_pose.geometry.absolute_pose import CameraPose
 from lightning_pose.geometry.camera import Camera
-from lightning_pose.mapping.build_map import MappedFrames, add_frames, adjust_mapped, map_frames, summarize_tracks
-from lightning_pose.mapping.calibration import UNKNOWN, calibrate_map, locate_frames, measure_answers
+from lightning_pose.mapping.build_map import (
+    MappedFrames,
+    add_frames,
+    adjust_mapped,
+    map_frames,
+    roll_mapped,
+    summarize_tracks,
+)
+from lightning_pose.mapping.calibration import UNKNOWN, Measured, calibrate_map, locate_frames, measure_answers
 from lightning_pose.mapping.conventions import fit_focal_length
 from lightning_pose.mapping.frame_matches import match_nearby_frames
 from lightning_pose.mapping.frames import MapFrames
@@ -99,28 +106,30 @@ class MapBuilder:
             error_m = calibration.position_error * self.world_frame.scale
             self.say(
                 f"map of {len(frames)} frames: {len(point_map)} points, {point_map.n_bytes / 1e6:.1f} MB, "
-                f"bundle adjustment {'on' if self._adjusts else 'off'}; training frames left out in turn are located "
+                f"bundle adjustment {_describe_adjustment(mapped)}; training frames left out in turn are located "
                 f"to {error_m:.3g} {self.datamodule.scene.unit} and {calibration.orientation_error_deg:.2f} degrees "
                 "(median)"
             )
 
     def _choose_map(self, frames: MapFrames, camera: Camera) -> MappedFrames:
-        """The map of training frames, with bundle adjustment where that locates validation frames better."""
+        """The map of training frames, as given, adjusted, or with a rolling shutter: which locates frames best."""
         plain = map_frames(frames, adjust=False)
         if self.bundle_adjust is False or not len(plain.tracks.points):
             return plain
         adjusted = adjust_mapped(plain)
-        if self.bundle_adjust == "auto":
-            if len(self.datamodule.scene.splits["val"]):
-                val = self._read_frames(("val",), camera)
-                answers = [locate_frames(MapLocalizer(summarize_tracks(each)), val) for each in (plain, adjusted)]
-                before, after = (np.median(measure_answers(each, val).position) for each in answers)
-                self._val_answers = answers[1]
-            else:
-                before, after = (calibrate_map(each).position_error for each in (plain, adjusted))
-            self._adjusts = bool(after < before)
-        self._adjusted = adjusted if self._adjusts else None
-        return adjusted if self._adjusts else plain
+        rolled = roll_mapped(adjusted)
+        candidates = [adjusted, rolled, *([plain] if self.bundle_adjust == "auto" else [])]
+        if len(self.datamodule.scene.splits["val"]):
+            val = self._read_frames(("val",), camera)
+            answers = [locate_frames(MapLocalizer(summarize_tracks(each)), val) for each in candidates]
+            best = int(np.argmin([_measure_error(measure_answers(each, val)) for each in answers]))
+            self._val_answers = answers[best]
+        else:
+            best = int(np.argmin([_measure_error_left_out(each) for each in candidates]))
+        chosen = candidates[best]
+        self._adjusts = chosen is not plain
+        self._adjusted = chosen if self._adjusts else None
+        return chosen
 
     def _add_validation_frames(self, mapped: MappedFrames, every: MapFrames, camera: Camera) -> MappedFrames:
         """The map of training frames with the validation frames added where it locates them."""
@@ -188,3 +197,20 @@ class MapBuilder:
             f"{residual_px:.2f} px off their epipolar lines); data.camera sets another"
         )
         return Camera(width, height, focal_px, focal_px, (width - 1) / 2, (height - 1) / 2)
+
+
+def _measure_error(measured: Measured) -> float:
+    """Median error of positions times that of orientations."""
+    return float(np.median(measured.position) * np.median(measured.orientation_deg))
+
+
+def _measure_error_left_out(mapped: MappedFrames) -> float:
+    """The same of training frames that are left out of the map in turn."""
+    left_out = calibrate_map(mapped)
+    return left_out.position_error * left_out.orientation_error_deg
+
+
+def _describe_adjustment(mapped: MappedFrames) -> str:
+    if mapped.state is None:
+        return "off"
+    return "on, for a rolling shutter" if mapped.state.rolling else "on"

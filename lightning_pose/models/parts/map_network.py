@@ -34,7 +34,7 @@ MAP_SHAPES = {
     "position": ((0, 3), torch.float64),
     "given_rotation": ((0, 3, 3), torch.float64),
     "given_position": ((0, 3), torch.float64),
-    "camera": ((4,), torch.float64),
+    "camera": ((5,), torch.float64),
 }
 """Shape and type of each array of an empty `PointMap`; the descriptor's width is added."""
 
@@ -52,7 +52,7 @@ STORED = {
 
 CAMERA_NUMBERS = 15
 
-RESIZED = ("camera_numbers", *(name for name in MAP_SHAPES if name != "camera"))
+RESIZED = ("camera_numbers", *MAP_SHAPES)
 """Buffers whose length is that of the checkpoint: some lenses have more coefficients."""
 
 

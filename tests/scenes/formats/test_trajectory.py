@@ -11,7 +11,7 @@ import pytest
 
 from lightning_pose.errors import DataError
 from lightning_pose.scenes.formats import load_scene
-from lightning_pose.scenes.images import read_rgb
+from lightning_pose.scenes.images import read_gray
 from tests.data.helpers import make_image
 
 
@@ -71,7 +71,7 @@ def test_frames_of_a_video(times: list[float], tmp_path: Path, monkeypatch: pyte
     write_video(root / "walk.avi", 6)
     write_trajectory(root / "trajectory.txt", [(time, x) for x, time in enumerate(times)])
     scene = load_scene(root, val_fraction=0, test_fraction=0)
-    brightness = [np.mean(read_rgb(frame.image)) for frame in scene.frames]
+    brightness = [read_gray(frame.image).mean() for frame in scene.frames]
     np.testing.assert_allclose(brightness, [20, 60, 100], atol=4)
     np.testing.assert_allclose([frame.position_m[0] for frame in scene.frames], [0, 1, 2])
 
