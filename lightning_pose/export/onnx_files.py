@@ -176,7 +176,7 @@ def _trace(
 @contextlib.contextmanager
 def _silence() -> Iterator[None]:
     """Hide what torch's exporter says on its way."""
-    loggers = [logging.getLogger(name) for name in ("torch.onnx", "onnxscript", "onnx_ir", "torch.export")]
+    loggers = [logging.getLogger(name) for name in (None, "torch.onnx", "onnxscript", "onnx_ir", "torch.export")]
     levels = [logger.level for logger in loggers]
     for logger in loggers:
         logger.setLevel(logging.ERROR)
