@@ -6,6 +6,7 @@ from pathlib import Path
 
 import mlflow
 import numpy as np
+import pandas as pd
 import pytest
 import yaml
 
@@ -90,9 +91,11 @@ def _check_artifacts(workplace: Workplace, run_id: str, room: Path, figures: set
     assert kept("trajectories/truth") == kept("trajectories/predictions") != set()
     images = sorted(room.glob("seq-*/*.png"))[:2]
     mlflow.set_tracking_uri(workplace.uri)
-    poses = mlflow.pyfunc.load_model(f"runs:/{run_id}/model").predict([str(image) for image in images])
-    assert list(poses.columns) == ["x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"]
-    assert poses.shape == (2, 7)
+    poses = mlflow.pyfunc.load_model(f"runs:/{run_id}/model").predict(
+        pd.DataFrame({"image": [image.read_bytes() for image in images]})
+    )
+    assert list(poses.columns)[:7] == ["x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"]
+    assert len(poses) == 2
 
 
 def _class_of(class_path: str) -> type:

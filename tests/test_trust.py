@@ -102,8 +102,7 @@ def test_a_stranger_s_checkpoint_runs_nothing(
         Localizer.load(file)
     for verb in ("predict", "test", "validate"):
         assert trained.workplace.command(verb, "--ckpt_path", file, allow=()) == 2
-    for words in (("localize", file, "a.png"), ("export", file, "--out", "out"), ("export-map", file, "out")):
-        (trained.workplace.folder / "a.png").touch()
+    for words in (("localize", file, tmp_path), ("export", file, "--out", "out"), ("export-map", file, "out")):
         assert trained.workplace.command(*words) == 2
     assert not marker.exists()
     assert not (trained.workplace.folder / "ran").exists()

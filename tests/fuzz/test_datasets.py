@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,13 @@ from tests.fuzz.datasets import DATASETS, Damage, apply_damages, damages, write_
 LONGEST_ERROR = 4000
 
 
+@pytest.fixture(autouse=True)
+def _no_warnings() -> Iterator[None]:
+    logging.disable(logging.WARNING)
+    yield
+    logging.disable(logging.NOTSET)
+
+
 @pytest.mark.parametrize("name", DATASETS)
 def test_undamaged_dataset_is_read(name: str, tmp_path: Path) -> None:
     assert len(load_scene(write_files(tmp_path / "scene", DATASETS[name]), val_fraction=0).frames) >= 6
@@ -26,7 +34,6 @@ def test_undamaged_dataset_is_read(name: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", DATASETS)
 @given(chosen=damages, drop=st.booleans())
 def test_damaged_dataset_is_read_or_refused_in_one_line(name: str, chosen: list[Damage], drop: bool) -> None:
-    logging.getLogger("lightning_pose").setLevel(logging.ERROR)
     with tempfile.TemporaryDirectory() as folder:
         root = write_files(Path(folder) / "scene", apply_damages(DATASETS[name], chosen))
         try:

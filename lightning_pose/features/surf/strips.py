@@ -179,7 +179,9 @@ def get_program(height: int, width: int, make: Callable[[], Any]) -> Any:
     if getattr(_kept, "size", None) != (height, width):
         _kept.size = None  # what was kept is freed before there is more
         _kept.program = None
+        with torch.inference_mode(False):  # tensors made in that mode could not be written to outside it
+            program = make()
         if height * width > LARGEST_KEPT:
-            return make()
-        _kept.program, _kept.size = make(), (height, width)
+            return program
+        _kept.program, _kept.size = program, (height, width)
     return _kept.program

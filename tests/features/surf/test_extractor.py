@@ -159,6 +159,14 @@ def test_strips_find_the_maxima_that_whole_planes_have(shape: tuple[int, int]) -
     assert all(torch.equal(a[:, :count], b) for a, b in zip(wanted, found, strict=True))
 
 
+def test_memory_made_in_inference_mode_serves_outside_it() -> None:
+    integral = compute_integral_image(texture(120, 168))[0]
+    with torch.inference_mode():
+        _, *wanted = find_maxima_in_strips(integral, 0.5)
+    _, *found = find_maxima_in_strips(integral, 0.5)
+    assert all(torch.equal(a, b) for a, b in zip(wanted, found, strict=True))
+
+
 def test_threads_do_not_share_memory() -> None:
     surf, images = SURF(100), [texture(seed=seed) for seed in range(8)]
     with ThreadPoolExecutor(4) as pool:
