@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lightning_pose.errors import CheckpointError, ConfigError
+from lightning_pose.paths import STORE_VARIABLE
 
 if TYPE_CHECKING:
     from lightning_pose.localization.localizer import LocatingSystem
@@ -92,7 +95,8 @@ def _download_checkpoint(address: str, tracking_uri: str | None) -> Path:
     store = prepare_store(tracking_uri)
     try:
         place = _find_registered(address, store)
-        folder = Path(download_artifacts(place, tracking_uri=store, registry_uri=store))
+        with _use_store(store):
+            folder = Path(download_artifacts(place, tracking_uri=store, registry_uri=store))
     except (MlflowException, OSError) as error:
         reason = mask_passwords(" ".join(str(error).split()))[:200]
         raise ConfigError(
@@ -103,6 +107,22 @@ def _download_checkpoint(address: str, tracking_uri: str | None) -> Path:
     if len(checkpoints) != 1:
         raise ConfigError(f"{address} has {len(checkpoints)} checkpoints where a model that `fit` logged has one")
     return checkpoints[0]
+
+
+@contextmanager
+def _use_store(store: str) -> Iterator[None]:
+    """Let MLflow use this store; it looks a logged model up in the process's own, whichever is given."""
+    import mlflow
+
+    variable, process_uri = os.environ.get(STORE_VARIABLE), mlflow.get_tracking_uri()
+    mlflow.set_tracking_uri(store)
+    try:
+        yield
+    finally:
+        mlflow.set_tracking_uri(process_uri)
+        os.environ.pop(STORE_VARIABLE, None)  # `set_tracking_uri` sets it
+        if variable is not None:
+            os.environ[STORE_VARIABLE] = variable
 
 
 def _find_registered(address: str, store: str) -> str:

@@ -132,8 +132,8 @@ def test_a_checkpoint_holds_arrays_in_half_their_bytes_if_that_loses_nothing(
     for name, value in vars(network.point_map).items():
         np.testing.assert_array_equal(getattr(rebuilt.network.point_map, name), value)
     network = deepcopy(network)
-    network.seen_point.data[-1] = 70_000
-    network.points.data[0, 0] = 1 + 2**-40
+    network.get_buffer("seen_point").data[-1] = 70_000
+    network.get_buffer("points").data[0, 0] = 1 + 2**-40
     state = network.state_dict()
     assert (state["seen_point"].dtype, int(state["seen_point"][-1])) == (torch.int32, 70_000)
     assert (state["points"].dtype, float(state["points"][0, 0])) == (torch.float64, 1 + 2**-40)
