@@ -49,6 +49,8 @@ class _RunCheckpoint(ModelCheckpoint):
         Raises:
             CheckpointError: it cannot be made.
         """
+        if not trainer.is_global_zero:
+            return  # other processes do not know the run
         try:
             checkpoint_folder(trainer).mkdir(parents=True, exist_ok=True)
         except OSError as error:
