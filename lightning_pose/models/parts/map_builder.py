@@ -35,6 +35,9 @@ __all__ = ["BundleAdjust", "MapBuilder", "check_bundle_adjust", "check_keypoints
 
 BundleAdjust = bool | Literal["auto"]
 
+FEWEST_VAL = 10
+"""With fewer validation frames, training frames that are left out in turn say which map is best."""
+
 
 def check_bundle_adjust(value: object) -> None:
     """Raise ConfigError unless it is true, false or auto."""
@@ -119,7 +122,7 @@ class MapBuilder:
         adjusted = adjust_mapped(plain)
         rolled = roll_mapped(adjusted)
         candidates = [adjusted, rolled, *([plain] if self.bundle_adjust == "auto" else [])]
-        if len(self.datamodule.scene.splits["val"]):
+        if len(self.datamodule.scene.splits["val"]) >= FEWEST_VAL:
             val = self._read_frames(("val",), camera)
             answers = [locate_frames(MapLocalizer(summarize_tracks(each)), val) for each in candidates]
             best = int(np.argmin([_measure_error(measure_answers(each, val)) for each in answers]))
