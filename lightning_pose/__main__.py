@@ -49,7 +49,7 @@ Cheap camera localization: a folder of posed images in, a trained and measured l
 {verbs}
 
 Start with    python -m lightning_pose fit --config configs/quickstart.yaml
-Your data     python -m lightning_pose fit --config configs/surf_lstm.yaml --data.root DIR
+Your data     python -m lightning_pose fit --config configs/landmark_map.yaml --data.root DIR
 Every option  python -m lightning_pose VERB --help"""
 
 

@@ -56,7 +56,7 @@ HELP = {
     "fit": """Train a localizer, test its best checkpoint, and print it beside its baselines.
 
   the built-in room      fit --config configs/quickstart.yaml
-  your data              fit --config configs/surf_lstm.yaml --data.root DIR
+  your data              fit --config configs/landmark_map.yaml --data.root DIR
   video, unseen scenes   fit --config configs/cnn_rnn.yaml --data.train_scenes "[DIR]" --data.test_scenes "[DIR]"
   change any setting     ... --model.units 200 --data.extractor.n_features 100 --trainer.max_epochs 20
   another seed           ... --seed_everything 1

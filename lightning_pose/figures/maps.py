@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
@@ -80,6 +81,27 @@ def draw_matched_images(images: Sequence[MatchedImage], title: str = "Points of 
     return figure
 
 
+def _start_view(
+    points: np.ndarray, cameras: np.ndarray, plane: list[int], title: str, unit: str
+) -> tuple[Figure, Axes]:
+    """A figure of a plane of the world with the map's points (P, 3) in it, which holds all cameras (N, 3)."""
+    held = np.concatenate([np.quantile(points, [0.02, 0.98], axis=0) if len(points) else cameras[:1], cameras])
+    low, high = held.min(axis=0)[plane], held.max(axis=0)[plane]
+    margin = 0.05 * (high - low).max() + SMALLEST
+    figure = Figure(figsize=(8, 7), dpi=150, layout="constrained")
+    axes = figure.add_subplot(
+        title=title,
+        xlim=(low[0] - margin, high[0] + margin),
+        ylim=(low[1] - margin, high[1] + margin),
+        aspect="equal",
+        xlabel=f"{'xyz'[plane[0]]} ({unit})",
+        ylabel=f"{'xyz'[plane[1]]} ({unit})",
+    )
+    if len(points):
+        axes.plot(*points[:, plane].T, ".", color=TRAINING, markersize=1.5, label=f"{len(points):,} points of the map")
+    return figure, axes
+
+
 @matplotlib.rc_context(STYLE)
 def draw_map(
     points: np.ndarray,
@@ -102,13 +124,8 @@ def draw_map(
         unit: unit of all.
     """
     cameras = np.concatenate([training, truth])
-    plane = across, up = find_longest_axes(cameras)
-    held = np.concatenate([np.quantile(points, [0.02, 0.98], axis=0) if len(points) else cameras[:1], cameras])
-    low, high = held.min(axis=0)[list(plane)], held.max(axis=0)[list(plane)]
-    margin = 0.05 * (high - low).max() + SMALLEST
-    figure = Figure(figsize=(8, 7), dpi=150, layout="constrained")
-    axes = figure.add_subplot(title=title)
-    axes.plot(*points[:, plane].T, ".", color=TRAINING, markersize=1.5, label=f"{len(points):,} points of the map")
+    plane = find_longest_axes(cameras)
+    figure, axes = _start_view(points, cameras, plane, title, unit)
     axes.plot(*training[:, plane].T, ".", color="#8c8c8c", markersize=3, label="training frames")
     segments = list(np.stack([truth[:, plane], prediction[:, plane]], axis=1))
     axes.add_collection(LineCollection(segments, colors=TRUTH, linewidths=0.7, alpha=0.5))
@@ -116,13 +133,6 @@ def draw_map(
         if chosen.any():
             count = f"{label}, {chosen.sum()} of {len(chosen)}"
             axes.plot(*prediction[chosen][:, plane].T, "o", color=color, markersize=4, markeredgewidth=0, label=count)
-    axes.set(
-        xlim=(low[0] - margin, high[0] + margin),
-        ylim=(low[1] - margin, high[1] + margin),
-        aspect="equal",
-        xlabel=f"{'xyz'[across]} ({unit})",
-        ylabel=f"{'xyz'[up]} ({unit})",
-    )
     figure.legend(loc="outside lower center", ncols=4)
     return figure
 
@@ -155,29 +165,16 @@ def draw_trajectory(
         known = position[np.isfinite(position).all(axis=1)]
         known = known if len(known) else np.zeros((1, 3))
     points = known[:0] if points is None else points
-    plane = across, up = find_longest_axes(known)
+    plane = find_longest_axes(known)
     if down is not None and down.any():
-        plane = across, up = [axis for axis in range(3) if axis != int(np.abs(down).argmax())]
-    held = np.concatenate([np.quantile(points, [0.02, 0.98], axis=0) if len(points) else known[:1], known])
-    low, high = held.min(axis=0)[list(plane)], held.max(axis=0)[list(plane)]
-    margin = 0.05 * (high - low).max() + SMALLEST
-    figure = Figure(figsize=(8, 7), dpi=150, layout="constrained")
-    axes = figure.add_subplot(title=title)
-    if len(points):
-        axes.plot(*points[:, plane].T, ".", color=TRAINING, markersize=1.5, label=f"{len(points):,} points of the map")
+        plane = [axis for axis in range(3) if axis != int(np.abs(down).argmax())]
+    figure, axes = _start_view(points, known, plane, title, "scene's unit")
     joined = np.where(accepted[:, None], position, np.nan)[:, plane]
     axes.plot(*joined.T, "-", color=MODEL, linewidth=0.8, alpha=0.7)
     for chosen, marker, color, label in ((accepted, ".", MODEL, "accepted"), (~accepted, "x", REFUSED, "refused")):
         if chosen.any():
             count = f"{label}, {chosen.sum()} of {len(chosen)}"
             axes.plot(*position[chosen][:, plane].T, marker, color=color, markersize=5, label=count)
-    axes.set(
-        xlim=(low[0] - margin, high[0] + margin),
-        ylim=(low[1] - margin, high[1] + margin),
-        aspect="equal",
-        xlabel=f"{'xyz'[across]} (scene's unit)",
-        ylabel=f"{'xyz'[up]} (scene's unit)",
-    )
     figure.legend(loc="outside lower center", ncols=4)
     return figure
 

@@ -55,8 +55,8 @@ def refine_turning_pose(
         points: (N, 3), in the world.
         observed: (N, 2), normalised image coordinates.
         sigma: scale of Cauchy's weights, in normalised image coordinates.
-        turn_sd: standard deviation of each component of the turn, above 0; the more a turn exceeds it, the more the
-            images must speak for it.
+        turn_sd: standard deviation of each component of the turn, above 0; the prior of a turn is
+            normal with mean 0.
         steps: at most; fewer when the pose no longer moves.
     """
     rotation, position = pose

@@ -19,7 +19,8 @@ JsonValue = str | float | int | None | list["JsonValue"] | dict[str, "JsonValue"
 class LocatedPose:
     """A camera-to-world pose in the world of the training data, OpenCV axes, of the pixels as stored in the file.
 
-    A refused pose is the best guess that there is: of the most similar training frame, or of the network beside a map.
+    A refused pose is the best guess that there is: of the network beside a map, else of too few inliers, else of the
+    most similar training frame; `source` says which.
     An image that cannot be read has none: its numbers are nan.
 
     Attributes:

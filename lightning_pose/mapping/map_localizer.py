@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -90,6 +90,11 @@ class MapAnswer:
     @property
     def accepted(self) -> bool:
         return not self.reason
+
+    @property
+    def source(self) -> Literal["map", "nearest"]:
+        """What the pose comes from: its inliers in the map, even if they are too few, or the most similar frame."""
+        return "nearest" if self.covariance is None else "map"
 
 
 class MapLocalizer:

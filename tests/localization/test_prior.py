@@ -33,6 +33,7 @@ def test_a_prior_that_contradicts_is_a_refusal(localizer: Localizer, mapped_room
     pose = localizer.localize(mapped_room.images[4], prior=far)
     assert pose.status == "refused"
     assert pose.reason.startswith("contradicts the prior: ")
+    assert pose.source == "map"  # it is a pose of the map, although it is not believed
     assert math.isinf(pose.radius_m)
 
 

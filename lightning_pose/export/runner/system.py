@@ -151,7 +151,7 @@ class ExportedSystem:
         return np.ascontiguousarray(array)
 
     def combine(self, alone: NetworkAnswer | None, answer: MapAnswer | None) -> dict[str, Any]:
-        """The fields of a `LocatedPose`: the map's pose where it accepts, else the network's, or a frame's."""
+        """The fields of a `LocatedPose`: the map's pose where it accepts, else the network's, or the map's guess."""
         fields: dict[str, Any] = {}
         if alone is not None:
             fields = {
@@ -169,12 +169,12 @@ class ExportedSystem:
                 "quat_wxyz": Rotation.from_matrix(answer.pose.rotation).as_quat(scalar_first=True),
                 "radius_m": radius_m,
                 "radius_deg": radius_deg,
-                "source": "map" if answer.accepted else "nearest",
+                "source": answer.source,
+                "covariance": covariance,
             }
         return fields | {
             "status": "accepted" if answer.accepted else "refused",
             "reason": answer.reason,
-            "covariance": covariance,
             "inliers": answer.inliers,
             "visible": answer.visible,
         }

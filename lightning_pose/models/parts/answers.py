@@ -86,23 +86,24 @@ def answer_by_map(
         found: what the map says of the images.
         network: the map.
         scale: of its positions in the scene's unit.
-        refused: what holds where the map refuses; by default the nearest training frame, with no radius.
+        refused: what holds where the map refuses; by default the map's own guess, with no radius.
     """
     accepted = np.array([answer.accepted for answer in found], bool)
     radius, radius_deg = network.find_radii(list(found))
     radius_m = radius * scale
-    other: tuple[Source, ...] = ("nearest",) * len(found)
+    covariance = np.array([_turn_covariance(answer, scale, network) for answer in found]).reshape(-1, 6, 6)
+    other: tuple[Source, ...] = tuple(answer.source for answer in found)
     if refused is not None:
         other = refused.source
         radius_m, radius_deg = (
             np.where(accepted, of_map, of_other)
             for of_map, of_other in ((radius_m, refused.radius_m), (radius_deg, refused.radius_deg))
         )
+        covariance[~accepted] = np.nan  # of a pose that is not the answer
     source: tuple[Source, ...] = tuple("map" if ok else instead for ok, instead in zip(accepted, other, strict=True))
     reason = tuple(answer.reason for answer in found)
     position_m, quat_wxyz = (part.detach().cpu().numpy() for part in pose)
     inliers, visible = (np.array([getattr(answer, name) for answer in found]) for name in ("inliers", "visible"))
-    covariance = np.array([_turn_covariance(answer, scale, network) for answer in found]).reshape(-1, 6, 6)
     shown = tuple(answer.shown for answer in found)
     return Answers(position_m, quat_wxyz, source, reason, radius_m, radius_deg, inliers, visible, covariance, shown)
 
