@@ -17,7 +17,8 @@ from lightning_pose.geometry.triangulation import (
     sum_by_track,
     widest_angles_deg,
 )
-from lightning_pose.mapping.bundle_adjustment import Adjustment, CameraCorrection, adjust_bundle
+from lightning_pose.mapping.bundle_adjustment import Adjustment, adjust_bundle
+from lightning_pose.mapping.camera_correction import CameraCorrection
 from lightning_pose.mapping.depth_vote import vote_depths
 from lightning_pose.mapping.frames import MapFrames, find_turn_rates
 from lightning_pose.mapping.guided_matching import match_pairs

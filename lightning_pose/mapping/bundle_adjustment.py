@@ -9,15 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse.linalg import LinearOperator, cg
 from scipy.spatial.transform import Rotation
 
-from lightning_pose.geometry.rolling_shutter import derive_rolling
-from lightning_pose.geometry.triangulation import sum_by_track
+from lightning_pose.mapping.camera_correction import CameraCorrection
 from lightning_pose.mapping.frames import MapFrames, find_turn_rates
+from lightning_pose.mapping.normal_equations import NormalEquations, Unknowns
+from lightning_pose.mapping.observations import Cameras, Observations
 
-__all__ = ["Adjustment", "CameraCorrection", "adjust_bundle"]
+__all__ = ["Adjustment", "adjust_bundle"]
 
 CAUCHY_PX = 2.0
 """Scale of Cauchy's weights on image errors, which is also the errors' standard deviation."""
@@ -38,38 +37,6 @@ READOUT_SD = 0.5
 """Of the time that the rows in one unit of normalised image coordinates take, in intervals between frames."""
 
 STEPS = 6
-CG_STEPS = 15
-"""Conjugate gradients are not run to their end: 300 of them, and 12 steps, locate frames no better."""
-
-CG_TOLERANCE = 1e-2
-
-
-@dataclass(frozen=True)
-class CameraCorrection:
-    """Small errors of the assumed camera, as far as the map needs them. They are no calibration.
-
-    Attributes:
-        scale: true focal length by the assumed one.
-        centre: (2,) true principal point less the assumed one, in normalised image coordinates.
-        k1: first radial distortion coefficient.
-    """
-
-    scale: float = 1.0
-    centre: np.ndarray = field(default_factory=lambda: np.zeros(2))
-    k1: float = 0.0
-
-    def distort(self, points: np.ndarray) -> np.ndarray:
-        """Where (..., 2) ideal points appear under the assumed camera."""
-        squared = (points**2).sum(axis=-1, keepdims=True)
-        return self.scale * points * (1 + self.k1 * squared) + self.centre
-
-    def remove(self, points: np.ndarray) -> np.ndarray:
-        """The ideal points of (..., 2) points under the assumed camera: the inverse of `distort`."""
-        distorted = (points - self.centre) / self.scale
-        ideal = distorted
-        for _ in range(5):
-            ideal = distorted / (1 + self.k1 * (ideal**2).sum(axis=-1, keepdims=True))
-        return ideal
 
 
 @dataclass(frozen=True)
@@ -92,7 +59,7 @@ class Adjustment:
     points: np.ndarray
     offset_rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
     offset_position: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    camera: CameraCorrection = CameraCorrection()
+    camera: CameraCorrection = field(default_factory=CameraCorrection)
     rolling: bool = False
     readout: float = 0.0
 
@@ -100,6 +67,11 @@ class Adjustment:
     def camera_poses(self) -> tuple[np.ndarray, np.ndarray]:
         """Rotations (F, 3, 3) and centres (F, 3) of the cameras themselves, offset included."""
         return self.rotation @ self.offset_rotation, self.position + self.rotation @ self.offset_position
+
+    @property
+    def cameras(self) -> Cameras:
+        """Where the cameras are, and what is wrong with the assumed one."""
+        return Cameras(*self.camera_poses, self.camera, self.readout)
 
 
 def adjust_bundle(
@@ -120,6 +92,8 @@ def adjust_bundle(
         keypoint: (O,) int64, its keypoint.
         steps: of Levenberg-Marquardt.
     """
+    if not len(track):
+        return start
     problem = _Problem(start, given, track, frame, keypoint)
     state, damping = start, 1e-4
     cost = problem.cost(state)
@@ -137,18 +111,22 @@ def adjust_bundle(
 
 
 class _Problem:
-    """The residuals of one bundle adjustment, their derivatives, and one step."""
+    """What one bundle adjustment is about: observations and priors, its cost, and one step."""
 
     def __init__(
         self, start: Adjustment, given: MapFrames, track: np.ndarray, frame: np.ndarray, keypoint: np.ndarray
     ) -> None:
-        self.given, self.track, self.frame = given, track, frame
-        self.observed = given.points[frame, keypoint]
-        self.turn_rate = find_turn_rates(given.rotation)[frame][:, :, None] * start.rolling
-        self.sigma = CAUCHY_PX / given.focal_px[frame]
+        self.given = given
+        self.seen = Observations(
+            track,
+            frame,
+            np.ascontiguousarray(given.points[frame, keypoint].T),
+            CAUCHY_PX / given.focal_px[frame],
+            find_turn_rates(given.rotation).T * start.rolling,
+        )
         rotation, position = start.camera_poses
-        local = np.einsum("oji,oj->oi", rotation[frame], start.points[track] - position[frame])
-        depth = float(np.median(local[:, 2]))
+        axis, away = rotation[frame, :, 2], start.points[track] - position[frame]
+        depth = float(np.median((axis * away).sum(axis=1)))
         self.pose_sd = np.repeat([POSE_SD[0], POSE_SD[1] * depth], 3)
         focal_px = float(np.median(given.focal_px))
         self.shared_sd = np.array(
@@ -173,40 +151,20 @@ class _Problem:
         )
         return np.column_stack([turned, state.position - self.given.position]), shared
 
-    def image_errors(self, state: Adjustment) -> tuple[np.ndarray, np.ndarray]:
-        """(O, 2) projected less observed, and the points in their cameras (O, 3)."""
-        rotation, position = state.camera_poses
-        local = np.einsum("oji,oj->oi", rotation[self.frame], state.points[self.track] - position[self.frame])
-        ideal = local[:, :2] / np.maximum(local[:, 2:], 1e-9)
-        rolled = ideal + state.readout * self.find_rolling(ideal)
-        return state.camera.distort(rolled) - self.observed, local
-
-    def find_rolling(self, ideal: np.ndarray) -> np.ndarray:
-        """(O, 2) by how much a rolling shutter whose readout is 1 moves (O, 2) points."""
-        return (derive_rolling(ideal) @ self.turn_rate)[:, :, 0]
-
     def cost(self, state: Adjustment) -> float:
         """Cauchy's cost of the image errors and the squares of the priors."""
-        error, local = self.image_errors(state)
-        squared = np.where(local[:, 2] > 0, (error**2).sum(axis=1) / self.sigma**2, 1e6)
         of_poses, shared = self.prior_errors(state)
         priors = ((of_poses / self.pose_sd) ** 2).sum() + ((shared / self.shared_sd) ** 2).sum()
-        return float(np.log1p(squared).sum() + priors)
+        return self.seen.cost(state.cameras, state.points) + float(priors)
 
     def step(self, state: Adjustment, damping: float) -> Adjustment:
         """Where one damped Gauss-Newton step leads."""
-        error, local = self.image_errors(state)
-        root = np.sqrt(1 / (1 + (error**2).sum(axis=1) / self.sigma**2)) / self.sigma
-        root = np.where(local[:, 2] > 0, root, 0.0)
-        of_pose, of_shared, of_point = self._derive(state, local)
-        of_pose, of_shared, of_point = (block * root[:, None, None] for block in (of_pose, of_shared, of_point))
-        move, shared, points = _solve_schur(
-            (of_pose, of_shared, of_point),
-            (error * root[:, None]),
-            (self.frame, self.track, len(self.given), len(state.points)),
-            (self.prior_errors(state), self.pose_sd, self.shared_sd),
-            damping,
+        equations = NormalEquations(self.seen, state.cameras, state.points, damping)
+        pose_error, shared_error = self.prior_errors(state)
+        unknowns = Unknowns(
+            *_derive_cameras(state), pose_error, 1 / self.pose_sd**2, shared_error, 1 / self.shared_sd**2
         )
+        move, shared, points = equations.solve(unknowns)
         return replace(
             state,
             rotation=state.rotation @ Rotation.from_rotvec(move[:, :3]).as_matrix(),
@@ -223,127 +181,21 @@ class _Problem:
             readout=state.readout + float(shared[10]),
         )
 
-    def _derive(self, state: Adjustment, local: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Derivatives of the image errors: by pose (O, 2, 6), by what is shared (O, 2, 11), by point (O, 2, 3)."""
-        z = np.maximum(local[:, 2], 1e-9)
-        ideal = local[:, :2] / z[:, None]
-        squared = (ideal**2).sum(axis=1)
-        camera = state.camera
-        bent = camera.scale * (
-            (1 + camera.k1 * squared)[:, None, None] * np.eye(2) + 2 * camera.k1 * ideal[:, :, None] * ideal[:, None, :]
-        )
-        project = np.zeros((len(z), 2, 3))
-        project[:, 0, 0] = project[:, 1, 1] = 1 / z
-        project[:, :, 2] = -ideal / z[:, None]
-        by_local = bent @ project
-        rotation, _ = state.camera_poses
-        to_camera = np.swapaxes(rotation, 1, 2)[self.frame]
-        by_point = by_local @ to_camera
-        # The given pose turns by w in its own axes: local = X^T (exp(-w) (R^T (p - c)) - x), X and x the offset.
-        in_given = np.einsum("ij,oj->oi", state.offset_rotation, local) + state.offset_position
-        by_given = by_local @ state.offset_rotation.T
-        of_pose = np.concatenate([by_given @ _cross_matrices(in_given), -by_point], axis=2)
-        of_shared = np.concatenate(
-            [
-                by_local @ _cross_matrices(local),
-                -by_given,
-                (ideal * (1 + camera.k1 * squared)[:, None])[:, :, None],
-                np.broadcast_to(np.eye(2), (len(z), 2, 2)),
-                (camera.scale * ideal * squared[:, None])[:, :, None],
-                self.find_rolling(ideal)[:, :, None],
-            ],
-            axis=2,
-        )
-        return of_pose, of_shared, by_point
 
+def _derive_cameras(state: Adjustment) -> tuple[np.ndarray, np.ndarray]:
+    """(F, 6, 6) each: how cameras move, turn in their own axes and place in the world, by their poses and the offset.
 
-def _solve_schur(
-    blocks: tuple[np.ndarray, np.ndarray, np.ndarray],
-    error: np.ndarray,
-    sizes: tuple[np.ndarray, np.ndarray, int, int],
-    priors: tuple[tuple[np.ndarray, np.ndarray], np.ndarray, np.ndarray],
-    damping: float,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Solve the normal equations: conjugate gradients on poses and shared numbers, the points eliminated.
-
-    Returns:
-        the steps of poses (F, 6), of what is shared (11,), and of points (T, 3).
+    A pose that turns by w in its own axes turns its camera by X^T w, and moves it by R (w x x), X and x the offset.
     """
-    of_pose, of_shared, of_point = blocks
-    frame, track, n_frames, n_points = sizes
-    (pose_error, shared_error), pose_sd, shared_sd = priors
-    by_frame = np.argsort(frame, kind="stable")
-
-    def sum_by_frame(values: np.ndarray) -> np.ndarray:
-        return sum_by_track(frame, values.reshape(len(frame), -1), n_frames).reshape(-1, *values.shape[1:])
-
-    def sum_by_point(values: np.ndarray) -> np.ndarray:
-        return sum_by_track(track, values.reshape(len(track), -1), n_points).reshape(-1, *values.shape[1:])
-
-    # Points are whitened: their block of the normal equations becomes the identity.
-    point_block = sum_by_point(_multiply_blocks(of_point, of_point))
-    trace = np.trace(point_block, axis1=1, axis2=2)[:, None, None]
-    whiten = np.linalg.inv(np.linalg.cholesky(point_block + np.eye(3) * (damping * trace / 3 + 1e-12)))
-    of_point = of_point @ np.swapaxes(whiten, 1, 2)[track]
-    pose_block = sum_by_frame(_multiply_blocks(of_pose, of_pose)) + np.diag((1 + damping) / pose_sd**2)
-    both_block = sum_by_frame(_multiply_blocks(of_pose, of_shared)).reshape(6 * n_frames, -1)
-    flat_shared = of_shared.reshape(-1, of_shared.shape[2])
-    shared_block = np.einsum("oi,oj->ij", flat_shared, flat_shared) + np.diag((1 + damping) / shared_sd**2)
-    pose_point = _multiply_blocks(of_pose, of_point)
-    to_frames = _place_blocks(pose_point[by_frame], frame[by_frame], track[by_frame], n_frames, n_points)
-    to_points = _place_blocks(np.swapaxes(pose_point, 1, 2), track, frame, n_points, n_frames)
-    shared_point = sum_by_point(_multiply_blocks(of_point, of_shared)).reshape(3 * n_points, -1)
-    point_right = sum_by_point(_multiply_blocks(of_point, error[:, :, None])).ravel()
-    split = 6 * n_frames
-
-    def find_points(x: np.ndarray) -> np.ndarray:
-        return to_points @ x[:split] + np.einsum("ts,s->t", shared_point, x[split:])
-
-    def multiply(x: np.ndarray) -> np.ndarray:
-        points, poses, shared = find_points(x), x[:split], x[split:]
-        of_poses = np.einsum("fij,fj->fi", pose_block, poses.reshape(-1, 6)).ravel()
-        of_poses += np.einsum("fs,s->f", both_block, shared) - to_frames @ points
-        of_both = np.einsum("fs,f->s", both_block, poses) - np.einsum("ts,t->s", shared_point, points)
-        return np.concatenate([of_poses, of_both + shared_block @ shared])
-
-    precondition_poses, precondition_shared = np.linalg.inv(pose_block), np.linalg.inv(shared_block)
-
-    def precondition(x: np.ndarray) -> np.ndarray:
-        poses = np.einsum("fij,fj->fi", precondition_poses, x[:split].reshape(-1, 6)).ravel()
-        return np.concatenate([poses, precondition_shared @ x[split:]])
-
-    of_poses = sum_by_frame(_multiply_blocks(of_pose, error[:, :, None])).ravel() - to_frames @ point_right
-    of_both = np.einsum("oi,o->i", flat_shared, error.ravel()) - np.einsum("ts,t->s", shared_point, point_right)
-    right = -np.concatenate([of_poses + (pose_error / pose_sd**2).ravel(), of_both + shared_error / shared_sd**2])
-    shape = (len(right), len(right))
-    x, _ = cg(
-        LinearOperator(shape, matvec=multiply),  # pyright: ignore[reportCallIssue]
-        right,
-        rtol=CG_TOLERANCE,
-        maxiter=CG_STEPS,
-        M=LinearOperator(shape, matvec=precondition),  # pyright: ignore[reportCallIssue]
-    )
-    white = -(point_right + find_points(x)).reshape(-1, 3)
-    return x[:split].reshape(-1, 6), x[split:], np.einsum("tji,tj->ti", whiten, white)
+    by_pose, by_offset = np.zeros((len(state.position), 6, 6)), np.zeros((len(state.position), 6, 6))
+    by_pose[:, :3, :3] = state.offset_rotation.T
+    by_pose[:, 3:, :3] = -state.rotation @ _cross_matrix(state.offset_position)
+    by_pose[:, 3:, 3:] = by_offset[:, :3, :3] = np.eye(3)
+    by_offset[:, 3:, 3:] = state.rotation
+    return by_pose, by_offset
 
 
-def _multiply_blocks(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(O, I, J), the products of the transposed (O, 2, I) with (O, 2, J)."""
-    return np.swapaxes(a, 1, 2) @ b
-
-
-def _place_blocks(
-    blocks: np.ndarray, row: np.ndarray, column: np.ndarray, n_rows: int, n_columns: int
-) -> sparse.bsr_matrix:
-    """(I n_rows, J n_columns) with the (O, I, J) blocks at block rows `row`, ascending, and block columns `column`."""
-    _, height, width = blocks.shape
-    start = np.searchsorted(row, np.arange(n_rows + 1))
-    shape = (height * n_rows, width * n_columns)
-    return sparse.bsr_matrix((np.ascontiguousarray(blocks), column, start), shape=shape)
-
-
-def _cross_matrices(vectors: np.ndarray) -> np.ndarray:
-    """(N, 3, 3) matrices C of (N, 3) vectors v, so that C w = v x w."""
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(-1, 3, 3)
+def _cross_matrix(vector: np.ndarray) -> np.ndarray:
+    """The (3, 3) matrix C of a vector v (3,), so that C w = v x w."""
+    x, y, z = vector
+    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lightning_pose.geometry.camera import CAMERA_MODELS, Camera
-from lightning_pose.mapping.bundle_adjustment import CameraCorrection
+from lightning_pose.mapping.camera_correction import CameraCorrection
 
 __all__ = ["Reconstruction", "correct_camera", "write_colmap_model", "write_ply_files"]
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from lightning_pose.mapping.bundle_adjustment import CameraCorrection
+from lightning_pose.mapping.camera_correction import CameraCorrection
 from lightning_pose.mapping.frames import find_turn_rates
 
 __all__ = ["PointMap", "quantize_descriptors"]

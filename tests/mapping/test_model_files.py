@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lightning_pose.geometry.camera import Camera
-from lightning_pose.mapping.bundle_adjustment import CameraCorrection
+from lightning_pose.mapping.camera_correction import CameraCorrection
 from lightning_pose.mapping.model_files import Reconstruction, correct_camera, write_colmap_model, write_ply_files
 from lightning_pose.scenes.formats import load_scene
 from tests.mapping.helpers import make_walk

@@ -9,7 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lightning_pose.geometry.rolling_shutter import derive_rolling
-from lightning_pose.mapping.bundle_adjustment import Adjustment, CameraCorrection, adjust_bundle
+from lightning_pose.mapping.bundle_adjustment import Adjustment, adjust_bundle
+from lightning_pose.mapping.camera_correction import CameraCorrection
 from lightning_pose.mapping.depth_vote import vote_depths
 from lightning_pose.mapping.frames import find_distance_scale, find_turn_rates
 from lightning_pose.mapping.guided_matching import KeypointMatches, match_pairs
