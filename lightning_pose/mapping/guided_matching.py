@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from lightning_pose.geometry.epipolar import essential_matrices
 from lightning_pose.mapping.frames import MapFrames, find_distance_scale
@@ -69,58 +69,85 @@ def match_pairs(frames: MapFrames, pairs: np.ndarray, band_px: float = BAND_PX) 
     Returns:
         the matches, pair by pair.
     """
-    a, b = pairs.T
-    essential = essential_matrices(frames.rotation[a], frames.position[a], frames.rotation[b], frames.position[b])
-    rays = torch.from_numpy(np.concatenate([frames.points, np.ones_like(frames.points[..., :1])], axis=2)).float()
-    descriptors = torch.from_numpy(frames.descriptors)
-    size = np.maximum(frames.size_px / frames.focal_px[:, None], 1e-9)  # an angle: images may differ in size
-    octaves = torch.from_numpy(np.log2(size) / np.log2(SIZE_RATIO)).float()
-    padding = torch.from_numpy(np.where(frames.real, 0.0, FAR)).float()
-    band = torch.from_numpy(band_px / frames.focal_px).float()
-    scale = max((find_distance_scale(rows) for rows in frames.descriptors[:SAMPLE]), default=1.0)
-
-    def match_chunk(start: int) -> tuple[np.ndarray, ...]:
-        chunk = slice(start, start + BATCH)
-        i, j = torch.from_numpy(a[chunk]), torch.from_numpy(b[chunk])
-        lines = rays[i] @ torch.from_numpy(essential[chunk]).float().mT
-        lines = lines / (lines[..., :2].norm(dim=-1, keepdim=True).clamp(min=1e-12) * band[j][:, None, None])
-        limit = _limit_by_places(lines, octaves[i], padding[i], rays[j], octaves[j], padding[j])
-        similarity = torch.bmm(descriptors[i], descriptors[j].mT)
-        if scale != 1:  # as if the descriptors differed so many times less
-            similarity = similarity.sub_(1).div_(scale**2).add_(1)
-        return _take_mutual(torch.minimum(similarity, limit, out=limit), start)
-
-    pair, row_a, row_b, distance = _join(map_in_threads(match_chunk, range(0, len(pairs), BATCH)))
+    pair, row_a, row_b, similarity = _join(_PairMatcher(frames, pairs, band_px).match_all())
+    distance = np.sqrt(np.maximum(2 - 2 * similarity, 0))
     return KeypointMatches(pairs[pair], np.stack([row_a, row_b], axis=1), distance)
 
 
-def _limit_by_places(
-    lines: Tensor, octaves_a: Tensor, padding_a: Tensor, rays_b: Tensor, octaves_b: Tensor, padding_b: Tensor
-) -> Tensor:
-    """(B, N, N): above 1 where keypoint b may match keypoint a by its place and size, far below -1 elsewhere.
+class _PairMatcher:
+    """Matches pairs, some at a time, in arrays that each thread uses again: new ones would cost as much as the work.
 
-    The squared distance of b to the line of a and the squared difference of their sizes, in units of their limits, may
-    add up to 1. The squares are multiplied out, so that one product finds how much is left, many times enlarged.
+    Keypoint b may match keypoint a if the squared distance of b to the line of a and the squared difference of their
+    sizes, in units of their limits, add up to less than 1. The squares are multiplied out, so that one product finds
+    how much is left; many times enlarged, it is far below -1 or above 1.
     """
-    x, y, w = lines.unbind(2)
-    of_a = [x * x, y * y, 2 * x * y, 2 * x * w, 2 * y * w, w * w + octaves_a**2 + padding_a - 1, -2 * octaves_a]
-    u, v, one = rays_b.unbind(2)
-    of_b = [u * u, v * v, u * v, u, v, one, octaves_b]
-    of_a, of_b = [*of_a, one], [*of_b, octaves_b**2 + padding_b]
-    return torch.bmm(torch.stack(of_a, 2) * -ENLARGE, torch.stack(of_b, 1))
 
+    def __init__(self, frames: MapFrames, pairs: np.ndarray, band_px: float) -> None:
+        self.frames, self.pairs = frames, pairs
+        a, b = pairs.T
+        self.essential = essential_matrices(
+            frames.rotation[a], frames.position[a], frames.rotation[b], frames.position[b]
+        ).astype(np.float32)
+        self.rays = np.concatenate([frames.points, np.ones_like(frames.points[..., :1])], axis=2).astype(np.float32)
+        self.descriptors = torch.from_numpy(frames.descriptors)
+        size = np.maximum(frames.size_px / frames.focal_px[:, None], 1e-9)  # an angle: images may differ in size
+        self.octaves = (np.log2(size) / np.log2(SIZE_RATIO)).astype(np.float32)
+        self.own = self.octaves**2 + np.where(frames.real, 0.0, FAR).astype(np.float32)
+        self.band = (band_px / frames.focal_px).astype(np.float32)
+        self.scale = max((find_distance_scale(rows) for rows in frames.descriptors[:SAMPLE]), default=1.0)
+        u, v, one = np.moveaxis(self.rays, 2, 0)
+        self.places = torch.from_numpy(np.stack([u * u, v * v, u * v, u, v, one, self.octaves, self.own], axis=1))
+        self.buffers = threading.local()
 
-def _take_mutual(similarity: Tensor, first: int) -> tuple[np.ndarray, ...]:
-    """Pair, row a, row b and descriptor distance of what is each other's best and clearly the best."""
-    best_of_a, best_of_b = similarity.amax(2), similarity.amax(1)
-    pair, row_a = (best_of_a > 1 - MAX_DISTANCE**2 / 2).nonzero(as_tuple=True)
-    of_a = similarity.flatten(0, 1).index_select(0, pair * similarity.shape[1] + row_a)
-    value, row_b = best_of_a[pair, row_a], torch.from_numpy(of_a.numpy().argmax(axis=1))  # faster than torch's
-    of_a.scatter_(1, row_b[:, None], -1.0)
-    kept = (value == best_of_b[pair, row_b]) & ((1 - value) < RATIO**2 * (1 - of_a.amax(1)))
-    pair, row_a, row_b, value = pair[kept], row_a[kept], row_b[kept], value[kept]
-    distance = (2 - 2 * value).clamp(min=0).sqrt()
-    return (pair + first).numpy(), row_a.numpy(), row_b.numpy(), distance.numpy()
+    def match_all(self) -> list[tuple[np.ndarray, ...]]:
+        return map_in_threads(self._match, range(0, len(self.pairs), BATCH))
+
+    def _match(self, start: int) -> tuple[np.ndarray, ...]:
+        """Pair, row a, row b and similarity of what is each other's best and clearly the best."""
+        i, j = self.pairs[start : start + BATCH].T
+        similarity, limit = self._take_buffers(len(i))
+        for a, b, product in zip(i.tolist(), j.tolist(), torch.from_numpy(similarity), strict=True):
+            torch.mm(self.descriptors[a], self.descriptors[b].mT, out=product)
+        if self.scale != 1:  # as if the descriptors differed so many times less
+            similarity[:] = (similarity - 1) / self.scale**2 + 1
+        lines = torch.from_numpy(self._find_lines(i, j, start))
+        torch.bmm(lines, self.places[j], out=torch.from_numpy(limit))
+        np.minimum(similarity, limit, out=similarity)
+        rows = similarity.reshape(-1, similarity.shape[2])
+        best = rows.argmax(axis=1)
+        value = rows[np.arange(len(rows)), best]
+        mutual = value == np.take_along_axis(similarity.max(axis=1), best.reshape(len(i), -1), axis=1).ravel()
+        kept = np.flatnonzero(mutual & (value > 1 - MAX_DISTANCE**2 / 2))
+        rows[kept, best[kept]] = -1.0
+        kept = kept[1 - value[kept] < RATIO**2 * (1 - rows[kept].max(axis=1))]
+        pair, row_a = np.divmod(kept, similarity.shape[1])
+        return pair + start, row_a, best[kept], value[kept]
+
+    def _find_lines(self, i: np.ndarray, j: np.ndarray, start: int) -> np.ndarray:
+        """(B, N, 8): what `places` of frames j are multiplied with, for the keypoints of frames i."""
+        lines = self.rays[i] @ self.essential[start : start + BATCH].swapaxes(1, 2)
+        length = np.sqrt(lines[..., 0] ** 2 + lines[..., 1] ** 2)
+        lines /= (np.maximum(length, 1e-12) * self.band[j][:, None])[..., None]
+        x, y, w = np.moveaxis(lines, 2, 0)
+        of_a = [
+            x * x,
+            y * y,
+            2 * x * y,
+            2 * x * w,
+            2 * y * w,
+            w * w + self.own[i] - 1,
+            -2 * self.octaves[i],
+            self.rays[i, :, 2],
+        ]
+        return np.stack(of_a, axis=2) * np.float32(-ENLARGE)
+
+    def _take_buffers(self, n_pairs: int) -> tuple[np.ndarray, np.ndarray]:
+        """Two arrays (B, N, N) of this thread."""
+        if not hasattr(self.buffers, "arrays"):
+            n = self.frames.points.shape[1]
+            self.buffers.arrays = np.empty((BATCH, n, n), np.float32), np.empty((BATCH, n, n), np.float32)
+        one, other = self.buffers.arrays
+        return one[:n_pairs], other[:n_pairs]
 
 
 def _join(parts: list[tuple[np.ndarray, ...]]) -> tuple[np.ndarray, ...]:

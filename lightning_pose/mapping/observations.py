@@ -104,7 +104,7 @@ class View:
         self.error_v = rolled_v * bent + (self.camera.centre[1] - seen.observed[1])
 
     def derive(self) -> tuple[np.ndarray, np.ndarray]:
-        """Weighted derivatives (12, O) of both errors by a camera's movement and the cameras' numbers; last the errors."""
+        """Weighted, (12, O) each: derivatives of both errors by a camera's movement and numbers; then the errors."""
         u, v, camera = self.u, self.v, self.camera
         squared = u * u + v * v
         straight, cross = camera.scale * (1 + camera.k1 * squared), 2 * camera.scale * camera.k1
