@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from lightning_pose.geometry.absolute_pose import CameraPose
+from lightning_pose.geometry.absolute_pose import CameraPose, derive_pose, solve_scaled
 
-__all__ = ["TurningPose", "derive_rolling", "refine_turning_pose", "remove_rolling"]
+__all__ = ["TurningPose", "refine_turning_pose", "remove_rolling"]
 
 
 class TurningPose(NamedTuple):
@@ -31,18 +31,17 @@ class TurningPose(NamedTuple):
     turn: np.ndarray
 
 
-def derive_rolling(points: np.ndarray) -> np.ndarray:
-    """(N, 2, 3): by how much (N, 2) points move in the image by turn (radians in one unit of y)."""
-    return _derive_turn(points) * points[:, 1, None, None]
-
-
 def remove_rolling(points: np.ndarray, turn: np.ndarray) -> np.ndarray:
     """Where (..., 2) points would lie if the camera had stood still; `turn` (..., 3) is that of each point's image."""
-    flat, turns = points.reshape(-1, 2), np.broadcast_to(turn, (*points.shape[:-1], 3)).reshape(-1, 3)
-    still = flat
-    for _ in range(2):
-        still = flat - (_derive_turn(still) @ turns[:, :, None])[:, :, 0] * flat[:, 1:]
-    return still.reshape(points.shape)
+    u, v = np.moveaxis(points, -1, 0)
+    turn_x, turn_y, turn_z = np.moveaxis(np.asarray(turn), -1, 0)
+    still_u, still_v = u, v
+    for _ in range(2):  # as the camera turns by w in its own axes, a local point x moves by x x w
+        uv = still_u * still_v
+        moved_u = uv * turn_x - (1 + still_u * still_u) * turn_y + still_v * turn_z
+        moved_v = (1 + still_v * still_v) * turn_x - uv * turn_y - still_u * turn_z
+        still_u, still_v = u - moved_u * v, v - moved_v * v
+    return np.stack([still_u, still_v], axis=-1)
 
 
 def refine_turning_pose(
@@ -61,37 +60,27 @@ def refine_turning_pose(
     """
     rotation, position = pose
     turn = np.zeros(3)  # in units of turn_sd
-    normal = np.zeros((9, 9))
+    normal, right = np.zeros((9, 9)), np.zeros(9)
+    jacobian, y_turn = np.empty((9, 2, len(points))), turn_sd * observed[:, 1]
     for _ in range(steps):
-        local = (points - position) @ rotation
-        depth = np.maximum(local[:, 2:], 1e-9)
-        ideal = local[:, :2] / depth
-        turned = _derive_turn(ideal)
-        rolling = turned * (turn_sd * observed[:, 1, None, None])
-        error = ideal + rolling @ turn - observed
-        weight = 1 / (1 + (error**2).sum(axis=1) / sigma**2) / sigma**2
-        to_image = np.zeros((len(points), 2, 3))
-        to_image[:, 0, 0] = to_image[:, 1, 1] = 1
-        to_image[:, :, 2] = -ideal
-        jacobian = np.concatenate([turned, -(to_image / depth[:, :, None]) @ rotation.T, rolling], axis=2)
-        weighted = jacobian * weight[:, None, None]
-        normal = np.tensordot(weighted, jacobian, axes=([0, 1], [0, 1]))
-        right = np.tensordot(weighted, error, axes=([0, 1], [0, 1]))
+        x, y, z = rotation.T @ (points - position).T
+        one = 1 / np.maximum(z, 1e-9)
+        u, v = x * one, y * one
+        derive_pose(jacobian, rotation, u, v, one)
+        jacobian[6:] = jacobian[:3] * y_turn
+        error = np.stack([u, v]) + np.tensordot(turn, jacobian[6:], 1) - observed.T
+        weight = 1 / (1 + (error**2).sum(axis=0) / sigma**2) / sigma**2
+        weighted = (jacobian * weight).reshape(9, -1)
+        normal = weighted @ jacobian.reshape(9, -1).T
+        right = weighted @ error.ravel()
         normal[6:, 6:] += np.eye(3)
         right[6:] += turn
-        scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
-        step = -scale * np.linalg.lstsq(normal * np.outer(scale, scale), right * scale, rcond=1e-12)[0]
-        rotation = rotation @ Rotation.from_rotvec(step[:3]).as_matrix()
+        step = -solve_scaled(normal, right)
+        rotation = rotation @ cv2.Rodrigues(step[:3])[0]  # several times as fast as scipy's `Rotation`
         position = position + step[3:6]
         turn = turn + step[6:]
-        if np.abs(step[:3]).max() < 1e-7 and np.abs(step[3:6]).max() < 1e-7 * float(np.median(depth)):
+        if np.abs(step[:3]).max() < 1e-7 and np.abs(step[3:6]).max() < 1e-7 * float(np.median(z)):
             break
     both = normal[:6, 6:]
     of_pose = normal[:6, :6] - both @ np.linalg.solve(normal[6:, 6:], both.T)
     return TurningPose(CameraPose(rotation, position), of_pose, turn * turn_sd)
-
-
-def _derive_turn(points: np.ndarray) -> np.ndarray:
-    """(N, 2, 3): by how much (N, 2) points move as the camera turns in its own axes: a local point x moves by x x w."""
-    u, v = points.T
-    return np.stack([u * v, -(1 + u * u), v, 1 + v * v, -u * v, -u], axis=1).reshape(-1, 2, 3)

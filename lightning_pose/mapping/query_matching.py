@@ -20,6 +20,9 @@ VOTE_DISTANCE = 0.6
 VOTE_COLUMNS = 24
 """Dimensions in which the nearest point is found for a vote."""
 
+VOTE_ROWS = 50
+"""Keypoints that are compared at once: as many as fit a processor's cache."""
+
 FRAME_PRIOR = 20.0
 """Points added to a frame's own when its votes are divided by the root of their number."""
 
@@ -74,7 +77,9 @@ class QueryMatcher:
         if not len(descriptors) or not len(self._descriptors):
             return -1, NONE, NONE
         rows = np.arange(len(descriptors))
-        nearest = multiply(multiply(descriptors, self._main_axes), self._few_columns).argmax(axis=1)
+        few = multiply(descriptors, self._main_axes)
+        parts = [few[first : first + VOTE_ROWS] for first in range(0, len(few), VOTE_ROWS)]
+        nearest = np.concatenate([multiply(part, self._few_columns).argmax(axis=1) for part in parts])
         voted = nearest[self._compare(descriptors, rows, nearest) > 1 - VOTE_DISTANCE**2 / 2]
         first, last = self._first_of_point[voted], self._first_of_point[voted + 1]
         votes = np.bincount(
