@@ -225,7 +225,7 @@ def cut_map(folder: Path) -> None:
     [
         (
             change_facts(format_version=99),
-            r"has format 99, and this version reads up to 1; use the localizer.py in the",
+            r"has format 99, and this version reads up to 2; use the localizer.py in the",
         ),
         (change_facts(format_version=0), r"has format 0, which is not read any more; export the model again"),
         (change_facts(format="something"), r"is no localizer that `export` wrote"),

@@ -57,6 +57,7 @@ def fill(model: PoseModule, low: float = 0.0, high: float = 1.0) -> PoseModule:
         model.radius.set_training(features)
         model.radius.factors.copy_(torch.tensor([0.3, 2.0]))
         model.radius.floor.fill_(0.1)
+        model.radius.farthest.fill_(0.2)
     if isinstance(model, KernelPoseNet):
         model.network.set_landmarks(features, 0.2)
         model.network.weight.data.normal_()
@@ -121,10 +122,11 @@ def test_images_get_the_same_answers(name: str, tmp_path: Path) -> None:
         with torch.inference_mode():
             pose = model(batch)
             assert model.radius is not None
-            radius_m, radius_deg = (float(radius[0]) for radius in model.radius.find_radii(batch))
+            radii = [float(radius[0]) for radius in model.radius.find_radii(batch)]
+            excess = float(model.radius.measure_excess(batch)[0])
         np.testing.assert_allclose(found.position_m, pose.position_m[0], atol=2e-4)
         np.testing.assert_allclose(found.quat_wxyz, pose.quat_wxyz[0], atol=2e-4)
-        np.testing.assert_allclose([found.radius_m, found.radius_deg], [radius_m, radius_deg], rtol=1e-3)
+        np.testing.assert_allclose([found.radius_m, found.radius_deg, found.excess], [*radii, excess], rtol=1e-3)
 
 
 @pytest.mark.parametrize("name", CLIPS)
