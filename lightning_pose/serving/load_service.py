@@ -42,7 +42,8 @@ def load_service(source: str | Path, allow: Iterable[str] = ()) -> Service:
     localizer = Localizer.load(place, allow)
     if localizer.system.clips is not None:
         raise ConfigError(
-            f"{source} is a {localizer.system.name}, which locates videos; serve answers single images: use `localize`"
+            f"{source} is a {localizer.system.name}, which locates videos; serve answers single images: locate videos "
+            "with `python -m lightning_pose localize`, or frame by frame with VideoTracker in Python"
         )
     view = localizer.system.view
     size = (BLANK, BLANK) if view is None else (view.height, view.width)
