@@ -9,6 +9,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NoReturn, cast
 
+import numpy as np
 import torch
 import yaml
 from lightning import Trainer
@@ -22,6 +23,7 @@ from lightning_pose.data import SceneDataModule, require_clips
 from lightning_pose.errors import ConfigError
 from lightning_pose.evaluation.callback import TestReport
 from lightning_pose.evaluation.gather import gather_poses
+from lightning_pose.evaluation.images import match_rows
 from lightning_pose.evaluation.unseen import keep_unseen_frames
 from lightning_pose.localization.sequences import chain_test_split
 from lightning_pose.models import PoseModule
@@ -178,7 +180,7 @@ class PoseCLI(LightningCLI):
             print(f"{left_out} validation frames are left out: the model has learnt from them")
 
     def predict(self, model: PoseModule, datamodule: SceneDataModule, **kwargs: Any) -> None:
-        """Write one TUM file a sequence of the test split.
+        """Write one TUM file a sequence of the test split; refused frames are comments there.
 
         Raises:
             DataError: poses are not finite numbers.
@@ -197,8 +199,14 @@ class PoseCLI(LightningCLI):
             return
         frames = [scene.frames[i] for i in located.frame.tolist()]
         folder = Path(self.trainer.default_root_dir) / "predictions" / f"{type(model).__name__}-{scene.name}"
-        for file in write_sequences(folder, frames, located.position_m.numpy(), located.quat_wxyz.numpy()):
+        refused = np.zeros(len(frames), bool)
+        if not model.reads_clips:
+            test = datamodule.dataset("test")
+            refused = model.find_refused(test.__getitems__(match_rows(test.data.frame, located.frame).tolist()))
+        for file in write_sequences(folder, frames, located.position_m.numpy(), located.quat_wxyz.numpy(), refused):
             print(file)
+        if refused.any():
+            print(f"{refused.sum()} of {len(refused)} frames are refused, and have no pose there")
 
 
 class _OptionParser(argparse.ArgumentParser):

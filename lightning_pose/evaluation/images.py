@@ -14,7 +14,13 @@ from lightning_pose.data.batches import PoseBatch
 from lightning_pose.data.datamodule import SceneDataModule, scene_datamodule
 from lightning_pose.evaluation.baselines.images import BaselineResult, evaluate_baselines
 from lightning_pose.evaluation.costs import costs
-from lightning_pose.evaluation.maps import MapEvaluation, draw_examples, evaluate_map, measure_coverage
+from lightning_pose.evaluation.maps import (
+    MapEvaluation,
+    draw_examples,
+    evaluate_map,
+    measure_accepted,
+    measure_coverage,
+)
 from lightning_pose.evaluation.result import Evaluation, skill
 from lightning_pose.figures import images as image_figures
 from lightning_pose.figures.maps import draw_calibration
@@ -26,7 +32,7 @@ from lightning_pose.models.landmark_map import LandmarkMap
 from lightning_pose.models.parts.poses import Located
 from lightning_pose.scenes.scene import Scene
 
-__all__ = ["evaluate_images"]
+__all__ = ["evaluate_images", "match_rows"]
 
 CHUNK = 64
 """Frames that a network is asked for at once."""
@@ -91,7 +97,7 @@ def _evaluate_map(module: PoseModule, prediction: Pose, datamodule: SceneDataMod
 
 @torch.inference_mode()
 def _evaluate_radius(module: PoseModule, prediction: Pose, scene: Scene, test: PoseBatch) -> MapEvaluation:
-    """How well the radii of a regressor hold its errors; empty where it has none."""
+    """Which frames a regressor accepts, and how well its radii hold their errors; empty where it has none."""
     if module.radius is None:
         return MapEvaluation({}, {}, {})
     parts = [module.radius.find_radii(chunk.to(module.device)) for chunk in test.features.split(CHUNK)]
@@ -100,10 +106,15 @@ def _evaluate_radius(module: PoseModule, prediction: Pose, scene: Scene, test: P
         position_error_m(prediction.position_m.double(), test.position_m.double()).numpy(),
         orientation_error_deg(prediction.quat_wxyz.double(), test.quat_wxyz.double()).numpy(),
     )
-    metrics = measure_coverage(errors, radii)
+    accepted = ~module.find_refused(test)
+    metrics, rows = measure_accepted(errors, accepted)
+    if accepted.all():
+        rows = {}  # the same as all frames
+    errors, radii = ((each[0][accepted], each[1][accepted]) for each in (errors, radii))
+    coverage = measure_coverage(errors, radii)
     about = f"{module.system_name} on {scene.name}"
-    figures = {"calibration": draw_calibration(errors, radii, title=about, unit=scene.unit)} if metrics else {}
-    return MapEvaluation(metrics, {}, figures)
+    figures = {"calibration": draw_calibration(errors, radii, title=about, unit=scene.unit)} if coverage else {}
+    return MapEvaluation(metrics | coverage, rows, figures)
 
 
 @torch.inference_mode()

@@ -14,6 +14,7 @@ from lightning_pose.data.datamodule import SceneDataModule
 from lightning_pose.figures import maps as map_figures
 from lightning_pose.geometry.quaternions import orientation_error_deg, position_error_m
 from lightning_pose.mapping.map_localizer import MapAnswer
+from lightning_pose.metrics.catalog import MEDIANS
 from lightning_pose.metrics.summary import summarize_errors
 from lightning_pose.models.base import Pose
 from lightning_pose.models.parts.frame_cameras import list_cameras
@@ -22,7 +23,7 @@ from lightning_pose.models.parts.world_frame import WorldFrame
 from lightning_pose.scenes.images import read_rgb
 from lightning_pose.scenes.scene import Scene
 
-__all__ = ["MapEvaluation", "draw_examples", "evaluate_map", "measure_coverage"]
+__all__ = ["MapEvaluation", "draw_examples", "evaluate_map", "measure_accepted", "measure_coverage"]
 
 EXAMPLE_RANKS = (0.0, 0.5, 0.9, 1.0)
 """Of errors, at which test frames are shown."""
@@ -74,13 +75,7 @@ def evaluate_map(
     accepted = np.array([answer.accepted for answer in answers])
     radius, radius_deg = network.find_radii(list(answers))
     radius_m = radius * world_frame.scale
-    metrics = {"test/accepted": float(accepted.mean())}
-    rows: dict[str, Mapping[str, float]] = {}
-    if accepted.any():
-        held = summarize_errors(position[accepted], orientation[accepted])
-        rows[f"of these {accepted.mean():.0%} accepted"] = held
-        metrics["test/accepted_position_median_m"] = held["position_median_m"]
-        metrics["test/accepted_orientation_median_deg"] = held["orientation_median_deg"]
+    metrics, rows = measure_accepted((position, orientation), accepted)
     found = measure_coverage((position[accepted], orientation[accepted]), (radius_m[accepted], radius_deg[accepted]))
     metrics |= found
     about = f"{name} on {scene.name}"
@@ -139,6 +134,16 @@ def draw_examples(
         pixels = read_rgb(scene.frames[frame].image)
         images.append(map_figures.MatchedImage(pixels, seen, projected, observed, shown.inlier, about))
     return {"matched_images": map_figures.draw_matched_images(images, f"{name} on {scene.name}, test frames")}
+
+
+def measure_accepted(errors: Errors, accepted: np.ndarray) -> tuple[dict[str, float], dict[str, Mapping[str, float]]]:
+    """Metrics of the accepted (N,) of all frames, and a row of theirs for the printed table; no row without any."""
+    metrics = {"test/accepted": float(accepted.mean())}
+    if not accepted.any():
+        return metrics, {}
+    held = summarize_errors(*(error[accepted] for error in errors))
+    metrics |= {f"test/accepted_{name}": held[name] for name in MEDIANS}
+    return metrics, {f"of these {accepted.mean():.0%} accepted": held}
 
 
 def measure_coverage(errors: Errors, radii: Errors) -> dict[str, float]:

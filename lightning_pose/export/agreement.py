@@ -20,7 +20,8 @@ from lightning_pose.localization.located_pose import LocatedPose
 __all__ = ["MOST_DEG", "MOST_M", "Agreement", "compare_answers", "load_runner", "locate_images"]
 
 MOST_M, MOST_DEG = 1e-3, 0.05
-"""How far an exported folder's answers may be from those of its checkpoint."""
+"""How far an exported folder's answers may be from those of its checkpoint: rounding can decide whether one match is an
+inlier, and a map of few points then answers a little differently."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ class Agreement:
         """Refuse answers that differ.
 
         Args:
-            scale: of the scene's unit, in units of the size of metres.
+            scale: what counts as a metre, in the scene's unit.
 
         Raises:
             ConfigError: they do.
@@ -55,9 +56,9 @@ class Agreement:
             )
         if not (self.position_m <= MOST_M * scale and self.orientation_deg <= MOST_DEG):
             raise ConfigError(
-                f"the exported model's answers to {self.images} images are up to {self.position_m:.2g} m and "
-                f"{self.orientation_deg:.2g} deg from the checkpoint's; at most {MOST_M:g} m and {MOST_DEG:g} deg are "
-                "allowed, and nothing was written"
+                f"the exported model's answers to {self.images} images are up to {self.position_m:.2g} and "
+                f"{self.orientation_deg:.2g} deg from the checkpoint's; at most {MOST_M * scale:.2g} in the scene's "
+                f"unit and {MOST_DEG:g} deg are allowed, and nothing was written"
             )
 
 

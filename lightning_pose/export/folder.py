@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -99,7 +99,7 @@ def export_system(
         network = "onnxruntime>=1.18\n" if facts["network"] else ""
         (folder / "requirements.txt").write_text(REQUIREMENTS + network, encoding="utf-8")
         write_facts(folder, facts)
-        agreement = check_folder(folder, system, frames.images)
+        agreement = check_folder(folder, system, frames)
         facts["agreement"] = asdict(agreement)
         if int8:
             if not facts["network"]:
@@ -190,15 +190,15 @@ def write_facts(folder: Path, facts: Mapping[str, Any]) -> None:
     (folder / "localizer.json").write_text(json.dumps(facts, indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
-def check_folder(folder: Path, system: TrainedSystem, images: Sequence[Path]) -> Agreement:
+def check_folder(folder: Path, system: TrainedSystem, frames: CheckFrames) -> Agreement:
     """Compare the folder's answers, by its own runner, with the system's.
 
     Raises:
         ConfigError: they differ.
     """
-    ours = locate_images(Localizer(system), images)
+    ours = locate_images(Localizer(system), frames.images)
     with load_runner(folder) as runner:
-        theirs = locate_images(runner.Localizer.load(folder), images)
+        theirs = locate_images(runner.Localizer.load(folder), frames.images)
     found = compare_answers(ours, theirs)
-    found.check(system.model.world_frame.scale)
+    found.check(frames.metre or system.model.world_frame.scale)
     return found

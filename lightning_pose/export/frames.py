@@ -34,6 +34,7 @@ class CheckFrames:
         split: which frames of the run they are; empty for images of the user.
         position_m: (N, 3) of the truth; None for images of the user.
         quat_wxyz: (N, 4) likewise.
+        metre: what counts as a metre, in a scene whose unit is arbitrary; None if it is one of length, or unknown.
     """
 
     def __init__(
@@ -42,8 +43,10 @@ class CheckFrames:
         split: str = "",
         position_m: np.ndarray | None = None,
         quat_wxyz: np.ndarray | None = None,
+        metre: float | None = None,
     ) -> None:
         self.images, self.split, self.position_m, self.quat_wxyz = list(images), split, position_m, quat_wxyz
+        self.metre = metre
 
 
 def list_image_files(paths: Sequence[Path]) -> CheckFrames:
@@ -104,4 +107,10 @@ def find_run_frames(
         split,
         np.array([frame.position_m for frame in frames]),
         np.array([frame.quat_wxyz for frame in frames]),
+        None if scene.unit == "m" else measure_spread(np.array([frame.position_m for frame in scene.frames])),
     )
+
+
+def measure_spread(position: np.ndarray) -> float:
+    """Root mean square distance of positions (N, 3) from their mean, which of a walk in a room is about a metre."""
+    return float(np.sqrt(np.square(position - position.mean(axis=0)).sum(axis=1).mean()))

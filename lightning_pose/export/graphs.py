@@ -23,7 +23,7 @@ from lightning_pose.models.parts.motion import measure_motion
 
 __all__ = ["OUTPUTS", "ClipGraph", "PoseGraph", "make_graph"]
 
-OUTPUTS = ("position_m", "quat_wxyz", "radius_m", "radius_deg")
+OUTPUTS = ("position_m", "quat_wxyz", "radius_m", "radius_deg", "excess")
 """Names of what a graph of single images returns; a graph of clips returns the first two."""
 
 Decode = Callable[[Tensor], tuple[Tensor, Tensor]]
@@ -45,7 +45,7 @@ def make_graph(model: PoseModule, extractor: FeatureExtractor) -> nn.Module:
 
 
 class PoseGraph(nn.Module):
-    """One image to `OUTPUTS`: position (1, 3) float64, quaternion (1, 4), radii (1,) float64 (nan: unknown).
+    """One image to `OUTPUTS`: position (1, 3) float64, quaternion (1, 4); radii and excess (1,) float64 (nan: unknown).
 
     Args:
         model: any architecture of single images.
@@ -63,12 +63,12 @@ class PoseGraph(nn.Module):
 
     origin: Tensor
 
-    def forward(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def forward(self, image: Tensor) -> tuple[Tensor, ...]:
         features = self.features(image)
         position, quat_raw = self.decode(features)
         unknown = self.origin[:1] + torch.nan
-        radius_m, radius_deg = (unknown, unknown) if self.radius is None else self.radius(features)
-        return position.double() * self.scale + self.origin, quat_normalize(quat_raw), radius_m, radius_deg
+        certainty = (unknown,) * 3 if self.radius is None else self.radius(features)
+        return position.double() * self.scale + self.origin, quat_normalize(quat_raw), *certainty
 
 
 class ClipGraph(nn.Module):
@@ -116,13 +116,14 @@ class _CNNFeatures(nn.Module):
 
 
 class _Radius(nn.Module):
-    """What `ErrorRadius.find_radii` computes, with products instead of pools and distances that ONNX lacks."""
+    """The radii and the excess of `ErrorRadius`, with products instead of pools and distances that ONNX lacks."""
 
     def __init__(self, radius: ErrorRadius) -> None:
         super().__init__()
         for name in ("signs", "mean", "reference", "floor"):
             self.register_buffer(name, getattr(radius, name).float())
         self.factors = [factor or float("nan") for factor in radius.factors.tolist()]
+        self.farthest = (radius.limit or float("nan")) * (float(radius.farthest) or float("nan"))
         self.pools: tuple[Tensor, Tensor] | None = None
         if len(radius.input_shape) == 3 and radius.input_shape[0] <= 4:
             _, height, width = radius.input_shape
@@ -133,7 +134,7 @@ class _Radius(nn.Module):
     reference: Tensor
     floor: Tensor
 
-    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         features = features.float()
         if features.ndim == 3:
             features = features.sum(1)
@@ -142,7 +143,7 @@ class _Radius(nn.Module):
         keys = (F.normalize(features.flatten(1), dim=1) - self.mean) @ self.signs
         distance = (keys - self.reference).square().sum(1, keepdim=True).sqrt().amin(0)
         scale = (distance + self.floor).double()
-        return scale * self.factors[0], scale * self.factors[1]
+        return scale * self.factors[0], scale * self.factors[1], distance.double() / self.farthest
 
 
 def _make_pool(size: int) -> Tensor:

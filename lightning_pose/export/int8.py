@@ -11,7 +11,7 @@ import numpy as np
 from lightning_pose.errors import ConfigError
 from lightning_pose.export.agreement import locate_images
 from lightning_pose.export.frames import CheckFrames
-from lightning_pose.export.onnx_files import quantize_file
+from lightning_pose.export.quantize import quantize_file
 from lightning_pose.export.runner.system import ExportedSystem
 from lightning_pose.localization.localizer import Localizer
 
@@ -49,7 +49,7 @@ def shrink_network(folder: Path, network: str, frames: CheckFrames) -> Mapping[s
     size = small.stat().st_size / whole.stat().st_size
     if size > MOST_BYTES:
         raise ConfigError(
-            f"--int8 leaves {size:.0%} of the network's bytes: onnxruntime has no 8-bit form of its largest layers; "
+            f"--int8 leaves {size:.0%} of the network's bytes: its largest arrays are not weights of 32 bits; "
             "leave it out"
         )
     small.replace(whole)

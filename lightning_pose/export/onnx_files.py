@@ -23,7 +23,7 @@ from lightning_pose.models import PoseModule
 if TYPE_CHECKING:
     from onnx import ModelProto
 
-__all__ = ["OPSET", "quantize_file", "require_onnx", "write_onnx"]
+__all__ = ["OPSET", "require_onnx", "silence_exporter", "write_onnx"]
 
 OPSET = 20
 """Version of ONNX's operators; onnxruntime reads it from 1.17 on."""
@@ -32,9 +32,6 @@ EXTRA = "run `uv sync --extra export`, or `pip install onnx onnxscript onnxrunti
 
 CLIP_FRAMES = 5
 """Frames of the clip that a graph is traced with; it takes any number from 2."""
-
-LARGEST = 2**28
-"""Numbers in an array that is computed once and for all before weights are shrunk."""
 
 PREPARE = """
 <ir_version: {version}, opset_import: ["" : {opset}]>
@@ -154,7 +151,7 @@ def _trace(
 ) -> ModelProto:
     """The graph in ONNX; its one input is named `features`."""
     try:
-        with torch.no_grad(), _silence():
+        with torch.no_grad(), silence_exporter():
             program = torch.onnx.export(
                 graph,
                 (example,),
@@ -174,8 +171,8 @@ def _trace(
 
 
 @contextlib.contextmanager
-def _silence() -> Iterator[None]:
-    """Hide what torch's exporter says on its way."""
+def silence_exporter() -> Iterator[None]:
+    """Hide what torch's exporter and ONNX's optimizer say on their way."""
     loggers = [logging.getLogger(name) for name in (None, "torch.onnx", "onnxscript", "onnx_ir", "torch.export")]
     levels = [logger.level for logger in loggers]
     for logger in loggers:
@@ -202,15 +199,3 @@ def _make_preparation(extractor: CNN, version: int) -> ModelProto:
         version=version, opset=OPSET, side=extractor.side, short=extractor.short_side, rows=rows, columns=columns
     )
     return onnx.parser.parse_model(text)
-
-
-def quantize_file(path: Path, out: Path) -> None:
-    """Write a graph with its weights in 8 bits, and products in 8 bits where onnxruntime has them."""
-    import onnx
-    from onnxruntime.quantization import QuantType, quantize_dynamic
-    from onnxscript import optimizer
-
-    with _silence():
-        # Weights that the graph computes of others could not be shrunk.
-        folded = optimizer.optimize(onnx.load(path), input_size_limit=LARGEST, output_size_limit=LARGEST)
-        quantize_dynamic(folded, out, weight_type=QuantType.QInt8, per_channel=True)

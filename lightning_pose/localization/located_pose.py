@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-__all__ = ["JsonValue", "LocatedPose", "refuse_image", "stack_poses"]
+__all__ = ["JsonValue", "LocatedPose", "describe_excess", "refuse_image", "stack_poses"]
 
 JsonValue = str | float | int | None | list["JsonValue"] | dict[str, "JsonValue"]
 """What a JSON file can hold."""
@@ -26,7 +26,8 @@ class LocatedPose:
     Attributes:
         position_m: (3,) float64, the camera's centre in the scene's unit.
         quat_wxyz: (4,) float64, unit, camera-to-world.
-        status: `accepted`, or `refused`. Systems without a map refuse blank images alone.
+        status: `accepted`, or `refused`. Systems without a map refuse blank images, and those that are too far from the
+            training images in the features (`distance_limit`).
         reason: why it is refused; empty if it is accepted.
         source: what the pose comes from: the landmark `map`, the `network`, or the `nearest` training frame;
             `none` if the image cannot be read.
@@ -121,6 +122,15 @@ def stack_poses(poses: Sequence[LocatedPose]) -> tuple[np.ndarray, np.ndarray]:
     """
     position_m = np.array([pose.position_m for pose in poses], np.float64).reshape(-1, 3)
     return position_m, np.array([pose.quat_wxyz for pose in poses], np.float64).reshape(-1, 4)
+
+
+def describe_excess(excess: float) -> str:
+    """Why a network refuses an image, from its distance to the training images by the largest accepted; nan: unknown.
+
+    >>> describe_excess(1.84), describe_excess(0.7), describe_excess(math.nan)
+    ('unlike the training images: 1.84 times the distance limit', '', '')
+    """
+    return f"unlike the training images: {excess:.2f} times the distance limit" if excess > 1 else ""
 
 
 def refuse_image(image: str | None, reason: str) -> LocatedPose:

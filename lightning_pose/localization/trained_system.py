@@ -20,7 +20,7 @@ from lightning_pose.geometry.camera import Camera
 from lightning_pose.geometry.relative import RelativeFrame
 from lightning_pose.localization.image_sizes import enlarge_image
 from lightning_pose.localization.inputs import Color, LoadedImage
-from lightning_pose.localization.located_pose import LocatedPose
+from lightning_pose.localization.located_pose import LocatedPose, describe_excess
 from lightning_pose.localization.sequences import ClipFollower, locate_sequence
 from lightning_pose.mapping.map_localizer import ShownPoints
 from lightning_pose.scenes.cameras import scale_camera
@@ -187,11 +187,12 @@ def _read_answer(answers: Answers, milliseconds: dict[str, float], image: str | 
     """The only one of a model's answers."""
     inliers, visible = int(answers.inliers[0]), int(answers.visible[0])
     covariance = answers.covariance[0]
+    reason = answers.reason[0] or describe_excess(float(answers.excess[0]))
     return LocatedPose(
         position_m=answers.position_m[0].astype(np.float64),
         quat_wxyz=answers.quat_wxyz[0].astype(np.float64),
-        status="refused" if answers.reason[0] else "accepted",
-        reason=answers.reason[0],
+        status="refused" if reason else "accepted",
+        reason=reason,
         source=answers.source[0],
         radius_m=float(answers.radius_m[0]),
         radius_deg=float(answers.radius_deg[0]),

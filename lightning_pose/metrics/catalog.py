@@ -95,7 +95,7 @@ SKILLS = {
 """Median errors of the model, divided by those of `reference_baseline`: `test/NAME`."""
 
 MAP = {
-    "accepted": Metric("share of frames that the map accepts", form=".0%", higher_is_better=True),
+    "accepted": Metric("share of frames that are accepted", form=".0%", higher_is_better=True),
     "accepted_position_median_m": Metric("median position error of accepted frames", "m", form=".3f"),
     "accepted_orientation_median_deg": Metric("median orientation error of accepted frames", "°", form=".2f"),
     "coverage_position": Metric("share of positions within their 90 % radius", form=".0%"),
@@ -103,8 +103,7 @@ MAP = {
     "radius_median_m": Metric("median 90 % radius of positions", "m", form=".3f"),
     "radius_median_deg": Metric("median 90 % radius of orientations", "°", form=".2f"),
 }
-"""Of systems with a landmark map, beside their errors: `test/NAME`. Coverage and radii are those of accepted frames; a
-regressor of single images without a map has these four too, of all frames."""
+"""Of systems for single images, beside their errors: `test/NAME`. Coverage and radii are those of accepted frames."""
 
 REFINED = {
     "alone_position_median_m": Metric("median position error without the map", "m", form=".3f"),

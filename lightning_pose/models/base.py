@@ -81,9 +81,11 @@ class PoseModule(RefinedModule, StandardizedModule):
             mean over the training frames. Descriptors have unit length, so that their elements are small.
         refine: build a landmark map of the same frames, whose pose a frame has where the map accepts it; `true`, or
             settings of the map.
+        distance_limit: refuse images that are farther from the training images, in the features, than this times the
+            farthest validation frame; null refuses none. Where a map is, it decides instead.
 
     Raises:
-        ConfigError: `input_shape` does not suit the architecture, or a rate is out of its range.
+        ConfigError: `input_shape` does not suit the architecture, or a number is out of its range.
     """
 
     input_ranks: ClassVar[tuple[int, ...]]
@@ -101,6 +103,7 @@ class PoseModule(RefinedModule, StandardizedModule):
         standardize: bool = True,
         standardize_features: bool = True,
         refine: bool | MapSettings = False,
+        distance_limit: float | None = 1.25,
     ) -> None:
         super().__init__()
         loss = LossConfig(**loss) if isinstance(loss, dict) else loss or LossConfig()
@@ -128,7 +131,7 @@ class PoseModule(RefinedModule, StandardizedModule):
         self.val_metrics, self.val_losses = PoseMetrics(), ItemMeans()
         self.test_metrics, self.test_losses = PoseMetrics(), ItemMeans()
         self.register_scales()
-        self.register_refinement(refine)
+        self.register_refinement(refine, distance_limit)
 
     @property
     def headline(self) -> str:

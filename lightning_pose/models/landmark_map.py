@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, ClassVar, cast
 
+import numpy as np
 import torch
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor, nn
@@ -129,6 +130,9 @@ class LandmarkMap(TrainingMemory, PoseModule):
     def locate_frames(self, batch: PoseBatch) -> list[MapAnswer]:
         """What the map says of frames of the trainer's data module, in the map's own unit."""
         return self.network.locate(batch.features, self._list_cameras(batch.frame))
+
+    def find_refused(self, batch: PoseBatch) -> np.ndarray:
+        return np.array([not answer.accepted for answer in self.locate_frames(batch)], bool)
 
     @property
     def map_network(self) -> MapNetwork | None:

@@ -22,6 +22,7 @@ def write_tum(
     position_m: np.ndarray,
     quat_wxyz: np.ndarray,
     images: Sequence[str] | None = None,
+    refused: np.ndarray | None = None,
 ) -> None:
     """Write M camera-to-world poses.
 
@@ -31,23 +32,33 @@ def write_tum(
         position_m: (M, 3).
         quat_wxyz: (M, 4); the file has the scalar last.
         images: M names; each is written as a comment in the line above its pose, which readers of TUM files skip.
+        refused: (M,) bool, poses that are left out; a comment says so.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     rows = np.column_stack([timestamps, position_m, np.roll(quat_wxyz, -1, axis=1)])
     with path.open("w", encoding="utf-8") as file:
         file.write("# timestamp tx ty tz qx qy qz qw\n")
         for i, row in enumerate(rows):
+            left_out = refused is not None and bool(refused[i])
             if images is not None:
-                file.write(f"# {' '.join(images[i].splitlines())}\n")
+                file.write(f"# {' '.join(images[i].splitlines())}{' refused' * left_out}\n")
+            if left_out:
+                continue
             file.write(f"{row[0]:.6f} {' '.join(f'{value:.9f}' for value in row[1:])}\n")
 
 
-def write_sequences(folder: Path, frames: Iterable[Frame], position_m: np.ndarray, quat_wxyz: np.ndarray) -> list[Path]:
+def write_sequences(
+    folder: Path,
+    frames: Iterable[Frame],
+    position_m: np.ndarray,
+    quat_wxyz: np.ndarray,
+    refused: np.ndarray | None = None,
+) -> list[Path]:
     """Write the poses of each sequence's frames into `folder/SEQUENCE.tum`, and return the files.
 
     Above each pose stands the name of its image, relative to the folder that the sequence's images share. If the
     dataset has no times, or if two frames of a sequence have the same time, the numbers of frames are written in place
-    of times.
+    of times. Poses that are `refused` (M,) are left out, as `write_tum` does.
     """
     rows: dict[str, list[int]] = {}
     frames = list(frames)
@@ -58,7 +69,8 @@ def write_sequences(folder: Path, frames: Iterable[Frame], position_m: np.ndarra
         files.append(folder / f"{sequence.replace('/', '_')}.tum")
         chosen = [frames[i] for i in members]
         times = _find_times(chosen, sequence)
-        write_tum(files[-1], times, position_m[members], quat_wxyz[members], _name_images(chosen))
+        left_out = None if refused is None else refused[members]
+        write_tum(files[-1], times, position_m[members], quat_wxyz[members], _name_images(chosen), left_out)
     return files
 
 

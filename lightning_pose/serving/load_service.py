@@ -41,7 +41,10 @@ def load_service(source: str | Path, allow: Iterable[str] = ()) -> Service:
         place = find_checkpoint(source)
     localizer = Localizer.load(place, allow)
     if localizer.system.clips is not None:
-        raise ConfigError(f"{source} is a {localizer.system.name}, which locates videos; serve answers single images")
+        raise ConfigError(
+            f"{source} is a {localizer.system.name}, which locates videos; serve answers single images: locate videos "
+            "with `python -m lightning_pose localize`, or frame by frame with VideoTracker in Python"
+        )
     view = localizer.system.view
     size = (BLANK, BLANK) if view is None else (view.height, view.width)
     localizer.localize(np.zeros((*size, 3), np.uint8))

@@ -59,5 +59,5 @@ def test_trained_and_carried_numbers(tmp_path: Path) -> None:
     found = costs(trainer, model, features=False)
     assert found["cost/parameters"] == 6 * 7
     # landmarks, scale and bias; scales of poses and features, the hemisphere of quaternions, the world's frame, and of
-    # radii the mean of the features, the median distance and two factors
-    assert found["cost/carried_numbers"] == 6 * 7 + 6 * 4 + 1 + 7 + 7 + 7 + 4 + 4 + 4 + 4 + (4 + 1 + 2)
+    # radii the mean of the features, the median and the largest distance, and two factors
+    assert found["cost/carried_numbers"] == 6 * 7 + 6 * 4 + 1 + 7 + 7 + 7 + 4 + 4 + 4 + 4 + (4 + 2 + 2)

@@ -16,13 +16,16 @@ import pytest
 from lightning import Trainer
 
 from lightning_pose.__main__ import main
+from lightning_pose.checkpoint import read_checkpoint
 from lightning_pose.data import ImageDataModule
 from lightning_pose.errors import CheckpointError, ConfigError
 from lightning_pose.export.agreement import Agreement, compare_answers
+from lightning_pose.export.frames import find_run_frames
 from lightning_pose.export.runner.system import FORMAT_VERSION, ExportedSystem
 from lightning_pose.features import CNN
 from lightning_pose.localization.localizer import Localizer
 from lightning_pose.localization.located_pose import LocatedPose
+from lightning_pose.localization.trained_system import TrainedSystem
 from lightning_pose.models import LinearPoseNet
 from tests.export.helpers import BACKBONE, COLUMNS
 from tests.rooms import MappedRoom
@@ -162,7 +165,7 @@ def test_answers_that_differ_are_not_written(
     monkeypatch.setattr(map_files, "save_file", move_points)
     assert export(mapped_room.checkpoint, "--out", tmp_path / "out") == 2
     assert (
-        "from the checkpoint's; at most 0.001 m and 0.05 deg are allowed, and nothing was written"
+        "from the checkpoint's; at most 0.001 in the scene's unit and 0.05 deg are allowed, and nothing was written"
         in capsys.readouterr().err
     )
     assert not list(tmp_path.iterdir())
@@ -175,10 +178,25 @@ def test_agreement_in_units_of_the_scene() -> None:
     assert found.position_m == 0.5
     assert found.orientation_deg == pytest.approx(np.degrees(2e-4), rel=1e-6)
     found.check(scale=1000.0)
-    with pytest.raises(ConfigError, match=r"up to 0.5 m and 0.011 deg"):
+    with pytest.raises(ConfigError, match=r"up to 0.5 and 0.011 deg"):
         found.check(scale=1.0)
     with pytest.raises(ConfigError, match=r"accepts other images than the checkpoint: 1 of 2, the first is a.png"):
         Agreement(2, 0.0, 0.0, ("a.png",)).check(1.0)
+
+
+def test_a_metre_of_a_scene_without_metres(mapped_room: MappedRoom, tmp_path: Path) -> None:
+    poses = [np.eye(4) for _ in range(4)]
+    for pose, x in zip(poses, (-8, -4, 4, 8), strict=True):
+        pose[0, 3] = x
+    frames = [
+        {"file_path": str(image), "transform_matrix": pose.tolist()}
+        for image, pose in zip(mapped_room.images[:4], poses, strict=True)
+    ]
+    (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 300, "frames": frames}))
+    data = read_checkpoint(mapped_room.checkpoint)["lightning_pose"]["data"]
+    system = TrainedSystem.from_checkpoint(mapped_room.checkpoint)
+    assert find_run_frames(system, data, (), str(tmp_path)).metre == pytest.approx(np.sqrt(40))
+    assert find_run_frames(system, data, (), None).metre is None
 
 
 def test_a_folder_is_not_written_over(folder: Path, copied: Path, mapped_room: MappedRoom, tmp_path: Path) -> None:
@@ -225,7 +243,7 @@ def cut_map(folder: Path) -> None:
     [
         (
             change_facts(format_version=99),
-            r"has format 99, and this version reads up to 1; use the localizer.py in the",
+            r"has format 99, and this version reads up to 2; use the localizer.py in the",
         ),
         (change_facts(format_version=0), r"has format 0, which is not read any more; export the model again"),
         (change_facts(format="something"), r"is no localizer that `export` wrote"),

@@ -16,7 +16,8 @@ pytest.importorskip("onnxscript", reason="the extra `export` is not installed")
 from lightning_pose import models
 from lightning_pose.data.batches import PoseBatch
 from lightning_pose.errors import ConfigError
-from lightning_pose.export.onnx_files import quantize_file, write_onnx
+from lightning_pose.export.onnx_files import write_onnx
+from lightning_pose.export.quantize import quantize_file
 from lightning_pose.export.runner.clips import FrameFollower, chain_clips
 from lightning_pose.export.runner.network import Network, fit_pixels
 from lightning_pose.features import CNN, SURF, FeatureExtractor, Pixels
@@ -57,6 +58,7 @@ def fill(model: PoseModule, low: float = 0.0, high: float = 1.0) -> PoseModule:
         model.radius.set_training(features)
         model.radius.factors.copy_(torch.tensor([0.3, 2.0]))
         model.radius.floor.fill_(0.1)
+        model.radius.farthest.fill_(0.2)
     if isinstance(model, KernelPoseNet):
         model.network.set_landmarks(features, 0.2)
         model.network.weight.data.normal_()
@@ -121,10 +123,31 @@ def test_images_get_the_same_answers(name: str, tmp_path: Path) -> None:
         with torch.inference_mode():
             pose = model(batch)
             assert model.radius is not None
-            radius_m, radius_deg = (float(radius[0]) for radius in model.radius.find_radii(batch))
+            radii = [float(radius[0]) for radius in model.radius.find_radii(batch)]
+            excess = float(model.radius.measure_excess(batch)[0])
         np.testing.assert_allclose(found.position_m, pose.position_m[0], atol=2e-4)
         np.testing.assert_allclose(found.quat_wxyz, pose.quat_wxyz[0], atol=2e-4)
-        np.testing.assert_allclose([found.radius_m, found.radius_deg], [radius_m, radius_deg], rtol=1e-3)
+        np.testing.assert_allclose([found.radius_m, found.radius_deg, found.excess], [*radii, excess], rtol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["DensePoseNet", "CNNRNN"])
+def test_weights_of_eight_bits_answer_almost_the_same(name: str, tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    clips = name == "CNNRNN"
+    model = CNNRNN(input_shape=[12, 68], channels=16, units=24) if clips else DensePoseNet(input_shape=[COLUMNS])
+    write_onnx(fill(model), SURF(12, with_geometry=True) if clips else make_cnn(), tmp_path / "model.onnx")
+    quantize_file(tmp_path / "model.onnx", tmp_path / "small.onnx")
+    whole, small = (tmp_path / file for file in ("model.onnx", "small.onnx"))
+    assert small.stat().st_size < 0.5 * whole.stat().st_size
+    if clips:
+        given = torch.rand(1, 4, 12, 68).numpy()
+        answers = [np.concatenate(Network(file).locate_clip(given), axis=1) for file in (whole, small)]
+    else:
+        given = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
+        found = [Network(file).locate(given) for file in (whole, small)]
+        answers = [np.concatenate([pose.position_m - 1e6 * np.eye(3)[0], pose.quat_wxyz]) for pose in found]
+    assert not np.array_equal(*answers)
+    np.testing.assert_allclose(*answers, atol=0.03)
 
 
 @pytest.mark.parametrize("name", CLIPS)
@@ -171,13 +194,3 @@ def test_what_cannot_be_written_is_said(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="CNN3D of CNN maps cannot be exported"):
         write_onnx(CNN3D(input_shape=[4, 5, 5]), make_cnn("map"), tmp_path / "model.onnx")
     assert not list(tmp_path.iterdir())
-
-
-def test_weights_in_8_bits(tmp_path: Path) -> None:
-    model = fill(SurfLSTM(input_shape=[20, 64], units=64, layers=1))
-    write_onnx(model, SURF(20), tmp_path / "model.onnx")
-    quantize_file(tmp_path / "model.onnx", tmp_path / "small.onnx")
-    assert (tmp_path / "small.onnx").stat().st_size < 0.5 * (tmp_path / "model.onnx").stat().st_size
-    features = np.random.default_rng(0).random((1, 20, 64), np.float32)
-    whole, small = (Network(tmp_path / f"{name}.onnx").locate(features) for name in ("model", "small"))
-    assert 0 < np.linalg.norm(whole.position_m - small.position_m) < 0.2

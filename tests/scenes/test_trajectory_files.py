@@ -52,6 +52,17 @@ def test_each_pose_has_the_name_of_its_image(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.loadtxt(tmp_path / "walk.tum")[:, 0], [0, 1])
 
 
+def test_refused_poses_are_left_out_with_a_comment(tmp_path: Path) -> None:
+    frames = [frame("walk", i, image=f"room/walk/{i}.png") for i in range(3)]
+    (file,) = write_sequences(tmp_path, frames, POSITIONS, QUATS_WXYZ, np.array([False, True, False]))
+    assert [line for line in file.read_text().splitlines() if ".png" in line] == [
+        "# 0.png",
+        "# 1.png refused",
+        "# 2.png",
+    ]
+    np.testing.assert_allclose(np.loadtxt(file)[:, 0], [0, 2])
+
+
 def test_equal_times_become_numbers_of_frames(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     frames = [frame("walk", i, timestamp=1600000000.0 + 1e-7 * i) for i in range(3)]
     with caplog.at_level(logging.WARNING, "lightning_pose"):

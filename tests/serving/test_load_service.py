@@ -114,5 +114,5 @@ def test_systems_for_clips_are_refused(monkeypatch: pytest.MonkeyPatch, room: Ro
             self.clips = (4, "camera")
 
     monkeypatch.setattr("lightning_pose.localization.trained_system.TrainedSystem", Clips)
-    with pytest.raises(ConfigError, match="which locates videos; serve answers single images"):
+    with pytest.raises(ConfigError, match="which locates videos; serve answers single images: locate videos with"):
         load_service(room.checkpoint)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,12 +17,14 @@ __all__ = ["Network", "NetworkAnswer", "fit_pixels"]
 
 @dataclass(frozen=True)
 class NetworkAnswer:
-    """Position (3,) float64, quaternion (4,) of unit length, and radii that hold 90 % of errors; nan if unknown."""
+    """Position (3,) float64, quaternion (4,) of unit length, radii that hold 90 % of errors, and the distance to the
+    training images by the largest that is accepted; nan if unknown."""
 
     position_m: np.ndarray
     quat_wxyz: np.ndarray
     radius_m: float
     radius_deg: float
+    excess: float
 
 
 class Network:
@@ -53,8 +56,11 @@ class Network:
 
     def locate(self, image: np.ndarray) -> NetworkAnswer:
         """The answer for (H, W, 3) uint8 pixels, or for what `features` of the folder's `localizer.json` names."""
-        position_m, quat_wxyz, radius_m, radius_deg = map(np.asarray, self.session.run(None, {self.input: image}))
-        return NetworkAnswer(position_m[0], quat_wxyz[0].astype(np.float64), float(radius_m[0]), float(radius_deg[0]))
+        position_m, quat_wxyz, *certainty = map(np.asarray, self.session.run(None, {self.input: image}))
+        radius_m, radius_deg, *excess = (float(value[0]) for value in certainty)  # folders of version 1 have no third
+        return NetworkAnswer(
+            position_m[0], quat_wxyz[0].astype(np.float64), radius_m, radius_deg, *excess or [math.nan]
+        )
 
     def locate_clip(self, clip: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Positions (T, 3) and quaternions (T, 4), float64, of a clip (1, T, ...)."""

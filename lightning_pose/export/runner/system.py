@@ -27,7 +27,7 @@ from lightning_pose.geometry.absolute_pose import CameraPose
 from lightning_pose.geometry.camera import Camera
 from lightning_pose.localization.image_sizes import enlarge_image
 from lightning_pose.localization.inputs import Color, LoadedImage
-from lightning_pose.localization.located_pose import LocatedPose
+from lightning_pose.localization.located_pose import LocatedPose, describe_excess
 from lightning_pose.mapping.map_localizer import MapAnswer, MapLocalizer
 from lightning_pose.mapping.point_map import PointMap
 from lightning_pose.scenes.cameras import scale_camera
@@ -36,7 +36,7 @@ from lightning_pose.scenes.images import to_gray
 __all__ = ["FORMAT", "FORMAT_VERSION", "ExportedSystem", "read_facts"]
 
 FORMAT = "lightning_pose localizer"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 """Raised when older runners cannot ask a newer folder; those below `OLDEST_VERSION` cannot be asked any more."""
 
 OLDEST_VERSION = 1
@@ -154,11 +154,14 @@ class ExportedSystem:
         """The fields of a `LocatedPose`: the map's pose where it accepts, else the network's, or the map's guess."""
         fields: dict[str, Any] = {}
         if alone is not None:
+            reason = describe_excess(alone.excess)
             fields = {
                 "position_m": alone.position_m,
                 "quat_wxyz": alone.quat_wxyz,
-                "radius_m": alone.radius_m,
-                "radius_deg": alone.radius_deg,
+                "status": "refused" if reason else "accepted",
+                "reason": reason,
+                "radius_m": math.inf if reason else alone.radius_m,
+                "radius_deg": math.inf if reason else alone.radius_deg,
             }
         if answer is None or self.map is None:
             return fields

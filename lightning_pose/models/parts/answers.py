@@ -13,6 +13,7 @@ from torch import Tensor
 
 from lightning_pose.geometry.absolute_pose import CameraPose
 from lightning_pose.mapping.map_localizer import MapAnswer, ShownPoints
+from lightning_pose.models.parts.error_radius import ErrorRadius
 from lightning_pose.models.parts.map_network import MapNetwork
 from lightning_pose.models.parts.poses import Pose
 from lightning_pose.models.parts.world_frame import WorldFrame
@@ -32,6 +33,8 @@ class Answers:
         source: what each pose comes from: the `network`, the landmark `map`, or where a map alone refuses the image,
             the `nearest` training frame.
         reason: why the map refuses; empty where it accepts, and where there is none.
+        excess: (M,), how far an image of a network is from the training images, by the largest distance that is
+            accepted: above 1 is refused. nan where that is unknown, and of systems with a map, which decides itself.
         radius_m: (M,), around each position, holds 90 % of errors; nan where it is unknown, inf where refused.
         radius_deg: (M,), the same of orientations.
         inliers: (M,) int64, matches of the map within 3 px; -1 where there is no map.
@@ -46,6 +49,7 @@ class Answers:
     quat_wxyz: np.ndarray
     source: tuple[Source, ...]
     reason: tuple[str, ...]
+    excess: np.ndarray
     radius_m: np.ndarray
     radius_deg: np.ndarray
     inliers: np.ndarray
@@ -57,18 +61,23 @@ class Answers:
         return len(self.source)
 
 
-def answer_by_network(pose: Pose, radius_m: Tensor | None = None, radius_deg: Tensor | None = None) -> Answers:
-    """(M,) poses of a network, with the radii of their errors where they are known."""
+def answer_by_network(pose: Pose, radius: ErrorRadius | None = None, features: Tensor | None = None) -> Answers:
+    """(M,) poses of a network, with what is known of their errors from the features of the images."""
     count = len(pose.position_m)
-    unknown, none = np.full(count, np.nan), np.full(count, -1)
+    radius_m = radius_deg = excess = np.full(count, np.nan)
+    if radius is not None and features is not None:
+        excess = radius.measure_excess(features).double().numpy()
+        radius_m, radius_deg = (np.where(excess > 1, np.inf, radii.numpy()) for radii in radius.find_radii(features))
+    none = np.full(count, -1)
     position_m, quat_wxyz = (part.detach().cpu().numpy() for part in pose)
     return Answers(
         position_m,
         quat_wxyz,
         ("network",) * count,
         ("",) * count,
-        unknown if radius_m is None else radius_m.numpy(),
-        unknown if radius_deg is None else radius_deg.numpy(),
+        excess,
+        radius_m,
+        radius_deg,
         none,
         none,
         np.full((count, 6, 6), np.nan),
@@ -105,7 +114,10 @@ def answer_by_map(
     position_m, quat_wxyz = (part.detach().cpu().numpy() for part in pose)
     inliers, visible = (np.array([getattr(answer, name) for answer in found]) for name in ("inliers", "visible"))
     shown = tuple(answer.shown for answer in found)
-    return Answers(position_m, quat_wxyz, source, reason, radius_m, radius_deg, inliers, visible, covariance, shown)
+    unknown = np.full(len(found), np.nan)
+    return Answers(
+        position_m, quat_wxyz, source, reason, unknown, radius_m, radius_deg, inliers, visible, covariance, shown
+    )
 
 
 SPHERE = 1.4435

@@ -1,4 +1,4 @@
-"""ErrorRadius: how far a regressor's poses may be off, from how far an image is from the training images."""
+"""ErrorRadius: how far a regressor's poses may be off, and whether it refuses, by the distance to training images."""
 
 from __future__ import annotations
 
@@ -8,12 +8,11 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from lightning_pose.mapping.calibration import find_conformal_factor
-from lightning_pose.models.parts.memory import resize_tensors
 
 __all__ = ["ErrorRadius"]
 
-DIMENSIONS = 16
-"""Numbers that are kept of each training image: a file of 1000 images grows by 32 kB."""
+DIMENSIONS = 128
+"""Numbers of 16 bits that are kept of each training image: a file of 1000 images grows by 256 kB."""
 
 MOST = 1000
 """Training images that are kept, evenly spaced."""
@@ -21,7 +20,10 @@ MOST = 1000
 CELLS = 8
 """Pixels of an image are averaged over so many rows and columns."""
 
-BUFFERS = ("reference", "mean", "floor", "factors")
+LEAST_FRAMES = 10
+"""Fewer validation frames say too little about how far images may be."""
+
+BUFFERS = ("reference", "mean", "floor", "factors", "farthest")
 
 
 class ErrorRadius(nn.Module):
@@ -32,27 +34,31 @@ class ErrorRadius(nn.Module):
     (normalized conformal prediction: Papadopoulos, Gammerman, Vovk, 2008). They hold for further frames that are to the
     training frames as the validation frames are.
 
+    An image is refused if d is more than `limit` times the largest d of a validation frame.
+
     Args:
         input_shape: of one frame's features.
+        limit: see above; None refuses no image.
     """
 
     reference: Tensor
     mean: Tensor
     floor: Tensor
     factors: Tensor
+    farthest: Tensor
     signs: Tensor
 
-    def __init__(self, input_shape: tuple[int, ...]) -> None:
+    def __init__(self, input_shape: tuple[int, ...], limit: float | None = None) -> None:
         super().__init__()
         self.input_shape = input_shape
+        self.limit = limit
         width = _pool_features(torch.zeros(1, *input_shape)).shape[1]
-        bits = np.random.PCG64(0).random_raw(-(-width * DIMENSIONS // 64)).view(np.uint8)
-        signs = np.unpackbits(bits)[: width * DIMENSIONS].reshape(width, DIMENSIONS).astype(np.float32) * 2 - 1
-        self.register_buffer("signs", torch.from_numpy(signs / np.float32(DIMENSIONS**0.5)), persistent=False)
-        self.register_buffer("reference", torch.zeros(0, DIMENSIONS))
+        self.register_buffer("signs", _make_signs(width, DIMENSIONS), persistent=False)
+        self.register_buffer("reference", torch.zeros(0, DIMENSIONS, dtype=torch.float16))
         self.register_buffer("mean", torch.zeros(width))
         self.register_buffer("floor", torch.zeros(()))
         self.register_buffer("factors", torch.zeros(2))  # 0 is unknown
+        self.register_buffer("farthest", torch.zeros(()))  # likewise
         self._scores: list[Tensor] = []
         self.register_load_state_dict_pre_hook(_fit_before_load)
 
@@ -61,7 +67,7 @@ class ErrorRadius(nn.Module):
         kept = torch.linspace(0, len(features) - 1, min(MOST, len(features))).round().long()
         pooled = torch.cat([_pool_features(chunk) for chunk in features[kept].split(64)]).to(self.mean)
         self.mean = pooled.mean(0)
-        self.reference = (pooled - self.mean) @ self.signs
+        self.reference = ((pooled - self.mean) @ self.signs).half()
 
     def measure_distance(self, features: Tensor) -> Tensor:
         """(B,) distances of (B, *input_shape) features to the nearest training image."""
@@ -75,11 +81,11 @@ class ErrorRadius(nn.Module):
 
     def take_scores(self) -> Tensor:
         """(N, 3) distances and errors that were added; they are dropped."""
-        scores, self._scores = torch.cat([self.reference.new_zeros(0, 3), *self._scores]), []
+        scores, self._scores = torch.cat([self.mean.new_zeros(0, 3), *self._scores]), []
         return scores
 
     def calibrate(self, scores: Tensor) -> None:
-        """Find the factors from (N, 3) distances and errors; they stay unknown if there are too few."""
+        """Find the factors and the farthest frame from (N, 3) distances and errors; unknown if there are too few."""
         if not len(scores):
             return
         distance, *errors = scores.double().cpu().T
@@ -87,6 +93,7 @@ class ErrorRadius(nn.Module):
         scale = (distance + distance.median()).clamp(min=1e-9).numpy()
         factors = [find_conformal_factor(error.numpy() / scale) for error in errors]
         self.factors.copy_(torch.tensor(factors).nan_to_num(0.0))
+        self.farthest.fill_(float(distance.max()) if len(distance) >= LEAST_FRAMES else 0.0)
 
     def find_radii(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """(B,) radii in the scene's unit and in degrees; nan where they are unknown."""
@@ -97,9 +104,25 @@ class ErrorRadius(nn.Module):
         position, orientation = (factor or np.nan for factor in self.factors.tolist())
         return scale * position, scale * orientation
 
+    def measure_excess(self, features: Tensor) -> Tensor:
+        """(B,) distances by the largest that is accepted, so that above 1 is refused; nan where that is unknown."""
+        if not (self.limit and self.farthest > 0):
+            return torch.full((len(features),), torch.nan)
+        return (self.measure_distance(features) / (self.limit * self.farthest)).cpu()
+
     def resize(self, state_dict: dict[str, Tensor]) -> None:
-        """Make room for the training images of a state dict."""
-        resize_tensors(self, ("reference",), state_dict)
+        """Make room for the training images of a state dict; an older version kept fewer numbers of each."""
+        reference = state_dict.get("reference")
+        if reference is not None and reference.ndim == 2:
+            self.reference = torch.zeros_like(reference, device=self.mean.device)
+            self.signs = _make_signs(len(self.mean), reference.shape[1]).to(self.mean)
+
+
+def _make_signs(width: int, dimensions: int) -> Tensor:
+    """(width, dimensions), a random projection that keeps distances, the same for ever."""
+    bits = np.random.PCG64(0).random_raw(-(-width * dimensions // 64)).view(np.uint8)
+    signs = np.unpackbits(bits)[: width * dimensions].reshape(width, dimensions).astype(np.float32) * 2 - 1
+    return torch.from_numpy(signs / np.float32(dimensions**0.5))
 
 
 def _pool_features(features: Tensor) -> Tensor:

@@ -7,9 +7,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, ClassVar, cast
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from lightning_pose.data.batches import PoseBatch
 from lightning_pose.data.datamodule import SceneDataModule, scene_datamodule
 from lightning_pose.errors import CheckpointError, ConfigError, DataError
 from lightning_pose.geometry.absolute_pose import CameraPose
@@ -34,6 +36,9 @@ __all__ = ["RefinedModule"]
 
 PREFIX = "refinement."
 
+CHUNK = 64
+"""Frames that are measured at once."""
+
 _log = logging.getLogger("lightning_pose")
 
 
@@ -56,18 +61,24 @@ class RefinedModule(CheckpointHooks):
     input_shape: tuple[int, ...]
     world_frame: WorldFrame
 
-    def register_refinement(self, refine: bool | MapSettings | Mapping[str, Any]) -> None:
-        """Add the map that is asked for, empty.
+    def register_refinement(self, refine: bool | MapSettings | Mapping[str, Any], limit: float | None) -> None:
+        """Add the map that is asked for, empty, and what measures distances to training images.
+
+        Args:
+            refine: settings of the map.
+            limit: as `distance_limit` of `PoseModule`.
 
         Raises:
-            ConfigError: the architecture takes none.
+            ConfigError: the architecture takes no map, or the limit is out of its range.
         """
+        if limit is not None and not limit > 0:
+            raise ConfigError(f"distance_limit is {limit}; give a number above 0, such as 1.25, or null to refuse none")
         settings = MapSettings.parse(refine)
         if settings is not None and self.refusal:
             raise ConfigError(f"model.refine is on, but {type(self).__name__} {self.refusal}; leave it out")
         self.hparams["refine"] = False if settings is None else asdict(settings)
         self.refinement = None if settings is None else MapRefinement(settings)
-        self.radius = None if self.refusal else ErrorRadius(self.input_shape)
+        self.radius = None if self.refusal else ErrorRadius(self.input_shape, limit)
 
     @property
     def system_name(self) -> str:
@@ -134,6 +145,16 @@ class RefinedModule(CheckpointHooks):
             return pose
         return replace_accepted(pose, self.refinement.locate_frames(frame.tolist()), self.world_frame)
 
+    @torch.inference_mode()
+    def find_refused(self, batch: PoseBatch) -> np.ndarray:
+        """(B,) bool, which of the trainer's frames are refused: by the map where there is one, else by distance."""
+        if self.refinement is not None and self.refinement.has_map:
+            return np.array([not answer.accepted for answer in self.refinement.locate_frames(batch.frame.tolist())])
+        if self.radius is None:
+            return np.zeros(len(batch.frame), bool)
+        excess = [self.radius.measure_excess(part.to(self.device)) for part in batch.features.split(CHUNK)]
+        return (torch.cat(excess) > 1).numpy()
+
     @property
     def map_network(self) -> MapNetwork | None:
         """The landmark map of this system; None where it has none, or none yet."""
@@ -162,7 +183,7 @@ class RefinedModule(CheckpointHooks):
         if self.refinement is None and camera is not None:
             raise ConfigError(f"{type(self).__name__} does not use cameras; leave camera out")
         pose: Pose = self(features)
-        alone = answer_by_network(pose, *(() if self.radius is None else self.radius.find_radii(features)))
+        alone = answer_by_network(pose, self.radius, features)
         if self.refinement is None or not self.refinement.has_map or keypoints is None:
             return alone
         network = self.refinement.network
