@@ -37,6 +37,7 @@ from lightning_pose.runs.logger import find_last_run
 from lightning_pose.runs.recorder import RunRecorder
 from lightning_pose.runs.resume import check_architecture, check_resumable, check_same_settings, is_complete, read_seed
 from lightning_pose.scenes.trajectory_files import write_sequences
+from lightning_pose.tasks import SCHEDULER_HELP
 
 __all__ = ["PoseCLI", "main"]
 
@@ -94,7 +95,9 @@ class PoseCLI(LightningCLI):
         parser.link_arguments("data.input_shape", "model.init_args.input_shape", apply_on="instantiate")
         parser.add_lightning_class_args(BestCheckpoint, "best")
         parser.add_lightning_class_args(TestReport, "report")
-        if not str(parser.prog).endswith(("fit", "extract")):
+        if str(parser.prog).endswith("extract"):
+            parser.add_argument("--scheduler", type=str | None, help=SCHEDULER_HELP)
+        elif not str(parser.prog).endswith("fit"):
             parser.add_argument("--allow", action="append", help=ALLOW_HELP)
 
     def parse_arguments(self, parser: LightningArgumentParser, args: list[str]) -> None:

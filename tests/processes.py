@@ -14,7 +14,13 @@ from unittest import mock
 
 __all__ = ["ForkedProcess", "start_fork_server"]
 
-PRELOADED = ["tests.helpers", "lightning_pose.cli", "lightning_pose.commands.sweep", "lightning_pose.sweeps.workers"]
+PRELOADED = [
+    "tests.helpers",
+    "lightning_pose.cli",
+    "lightning_pose.commands.sweep",
+    "lightning_pose.sweeps.workers",
+    "distributed",
+]
 
 
 def start_fork_server() -> None:
@@ -54,6 +60,10 @@ class ForkedProcess:
         self._process.start()
 
     @property
+    def pid(self) -> int:
+        return self._process.pid or 0
+
+    @property
     def returncode(self) -> int | None:
         """The exit code, minus the signal's number where one ended it; None while it runs."""
         return self._process.exitcode
@@ -73,7 +83,7 @@ class ForkedProcess:
         return stdout, stderr
 
     def send_signal(self, number: int) -> None:
-        os.kill(self._process.pid or 0, number)
+        os.kill(self.pid, number)
 
     def kill(self) -> None:
         self._process.kill()

@@ -83,7 +83,8 @@ The checkpoint knows its architecture and its data; both can be overridden.
   predict --ckpt_path mlruns/checkpoints/RUN_ID/best.ckpt""",
     "extract": """Fill the feature cache that a config needs, on all cores; what is cached already is kept.
 
-  extract --config configs/surf_lstm.yaml --data.root DIR""",
+  extract --config configs/surf_lstm.yaml --data.root DIR
+  on many machines       ... --scheduler tcp://HOST:8786""",
 }
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -18,6 +18,7 @@ from lightning_pose.commands.parser import VerbParser
 from lightning_pose.errors import ConfigError, ImageError
 from lightning_pose.localization.pose_lines import LineFormat, PoseWriter, find_line_format
 from lightning_pose.localization.sources import ImageFiles, VideoSource, find_sources
+from lightning_pose.tasks import SCHEDULER_HELP
 
 if TYPE_CHECKING:
     from argparse import Namespace
@@ -66,6 +67,8 @@ def main(argv: list[str]) -> int:
         raise ConfigError("no inputs; give images, folders, videos, camera:0, or - for paths on stdin")
     if args.every < 1:
         raise ConfigError(f"--every is {args.every}; give 1 for all frames, 2 for every second one, and so on")
+    if args.workers < 1:
+        raise ConfigError(f"--workers is {args.workers}; give 1 or more")
     sources = find_sources(words, sys.stdin)
     from lightning_pose.localization.localizer import Localizer
 
@@ -85,6 +88,8 @@ def _build_parser() -> VerbParser:
         "--camera-index", metavar="N", type=int, action="append", default=[], help="a camera of this computer, from 0"
     )
     parser.add_argument("--every", metavar="N", type=int, default=1, help="locate every N-th frame of a video")
+    parser.add_argument("--workers", metavar="W", type=int, default=1, help="images located at once (default: 1)")
+    parser.add_argument("--scheduler", help=SCHEDULER_HELP)
     parser.add_argument("--sequence", action="store_true", help="images are frames of one video, in their order")
     parser.add_argument("--draw", metavar="FILE.png", type=Path, help="draw the trajectory over the map, from above")
     parser.add_argument("--view", metavar="FILE.rrd", type=Path, help="record for the rerun viewer (extra `view`)")
@@ -187,7 +192,12 @@ def _locate_sources(
         if isinstance(source, VideoSource):
             name, found, count = _open_video(localizer, camera, source, args.every)
         else:
-            name, found, count = "images", _locate_files(localizer, camera, source, follows), source.count
+            files = (
+                _track_files(localizer, camera, source.paths)
+                if follows
+                else _locate_files(localizer, camera, source, args)
+            )
+            name, found, count = "images", files, source.count
         task = bar.add_task(name, total=count)
         if isinstance(source, VideoSource) or follows:
             found = _report_losses(found, bar.console)
@@ -225,15 +235,30 @@ def _open_video(
     return Path(reader.name).name, locate_frames(), reader.count
 
 
-def _locate_files(localizer: Localizer, camera: Camera | None, images: ImageFiles, follows: bool) -> Iterator[Located]:
-    """The poses of image files, those that cannot be read refused."""
+def _locate_files(
+    localizer: Localizer, camera: Camera | None, images: ImageFiles, args: Namespace
+) -> Iterator[Located]:
+    """The poses of image files, each alone; several at a time if that is asked for."""
+    from lightning_pose.localization.parallel import ModelSource, locate_file, locate_files
+
+    if args.workers == 1 and args.scheduler is None:  # one by one, as paths arrive on standard input
+        found = (locate_file(localizer, camera, path) for path in images.paths)
+    else:
+        source = ModelSource(args.model, tuple(args.allow or ()), args.tracking_uri)
+        model = localizer if args.scheduler is None else source
+        found = locate_files(model, camera, images.paths, args.workers, args.scheduler)
+    yield from ((pose, None) for pose in found)
+
+
+def _track_files(localizer: Localizer, camera: Camera | None, paths: Iterable[str]) -> Iterator[Located]:
+    """The poses of image files that are frames of one video."""
     from lightning_pose.localization.located_pose import refuse_image
     from lightning_pose.localization.video import VideoTracker
 
-    tracker = VideoTracker(localizer, camera) if follows else None
-    for path in images.paths:
+    tracker = VideoTracker(localizer, camera)
+    for path in paths:
         try:
-            yield (localizer.localize(path, camera) if tracker is None else tracker.localize(path)), None
+            yield tracker.localize(path), None
         except (ImageError, ConfigError) as error:
             yield refuse_image(path, str(error)), None
 

@@ -16,6 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from lightning_pose.commands.parser import VerbParser
 from lightning_pose.errors import ConfigError
+from lightning_pose.tasks import SCHEDULER_HELP
 
 if TYPE_CHECKING:  # Optuna and Lightning take seconds, and `--help` does without
     from mlflow import MlflowClient
@@ -35,6 +36,7 @@ HELP = """Search the settings of a config for what is best on its validation fra
   20 trials more               sweep sweeps/surf_cnn.yaml --data.root DIR --n_trials 20
   four at a time               ... --workers 4
   many machines, one study     ... --storage postgresql://USER:PASSWORD@HOST/DATABASE
+  on a Dask cluster            ... --storage postgresql://... --scheduler tcp://HOST:8786
   change what is not searched  ... --trainer.max_epochs 10
   train and test the best      fit --config mlruns/sweeps/STUDY/best.yaml
   follow its progress          optuna-dashboard sqlite:///mlruns/optuna.db
@@ -115,7 +117,7 @@ def main(argv: list[str]) -> int:
         if is_grid(plan):
             total = min(count_waiting(study), math.inf if total is None else total)
         total = N_TRIALS if total is None else int(total)
-        _run_trials(study, plan, Job(plan, name, args.storage, parent), total, args.workers)
+        _run_trials(study, plan, Job(plan, name, args.storage, parent), total, args)
         client, parent = open_parent(study, plan)  # another one, if the user has deleted it meanwhile
         _write_results(study, plan, spec, client, parent, args.out or Path("mlruns") / "sweeps" / name)
         status = "FINISHED"
@@ -130,10 +132,10 @@ def main(argv: list[str]) -> int:
     return 0
 
 
-def _run_trials(study: Study, plan: Plan, job: Job, total: int, workers: int) -> None:
+def _run_trials(study: Study, plan: Plan, job: Job, total: int, args: argparse.Namespace) -> None:
     """Run the trials under a progress bar that shows the best value so far."""
     from lightning_pose.sweeps.results import describe_best
-    from lightning_pose.sweeps.workers import run_here, run_in_processes
+    from lightning_pose.sweeps.workers import run_here, run_in_processes, run_on_cluster
 
     console = Console(stderr=True)
     columns = (
@@ -149,10 +151,12 @@ def _run_trials(study: Study, plan: Plan, job: Job, total: int, workers: int) ->
             if not console.is_terminal:
                 print(f"trial {bar.tasks[0].completed:.0f}/{total}  {text}", file=sys.stderr, flush=True)
 
-        if workers == 1 or total < 2:
+        if args.scheduler is not None:
+            run_on_cluster(job, total, show_end, args.workers, args.scheduler)
+        elif args.workers == 1 or total < 2:
             run_here(job, total, show_end)
         else:
-            run_in_processes(job, total, show_end, workers)
+            run_in_processes(job, total, show_end, args.workers)
 
 
 def _write_results(
@@ -243,6 +247,7 @@ def _build_sweep_parser() -> VerbParser:
         "--n_trials", type=_parse_count(0), metavar="N", help="this many more (default: the file's, or 20)"
     )
     parser.add_argument("--workers", type=_parse_count(1), metavar="W", default=1, help="processes (default: 1)")
+    parser.add_argument("--scheduler", metavar="ADDRESS", help=SCHEDULER_HELP)
     parser.add_argument("--storage", metavar="URL", default="sqlite:///mlruns/optuna.db", help="default: %(default)s")
     parser.add_argument("--study", metavar="NAME", help="default: the file's name and the scene's")
     parser.add_argument("--out", metavar="DIR", type=Path, help="default: mlruns/sweeps/STUDY")

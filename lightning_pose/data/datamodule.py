@@ -19,6 +19,7 @@ from lightning_pose.data.batches import PoseBatch, PoseDataset, make_loader
 from lightning_pose.errors import ConfigError, DataError
 from lightning_pose.features import FeatureCache, FeatureExtractor
 from lightning_pose.features.cache import FillReport
+from lightning_pose.features.fill_cluster import fill_on_cluster
 from lightning_pose.geometry.camera import Camera
 from lightning_pose.paths import cache_folder
 from lightning_pose.scenes.cameras import make_camera
@@ -112,10 +113,13 @@ class SceneDataModule(LightningDataModule):
     def prepare_data(self) -> None:
         self.fill()
 
-    def fill(self) -> FillReport:
-        """Extract what the cache lacks, for every split."""
+    def fill(self, scheduler: str | None = None) -> FillReport:
+        """Extract what the cache lacks, for every split; with a scheduler on its cluster, see `run_tasks`."""
         used = sorted({int(i) for indices in self.scene.splits.values() for i in indices})
-        return self.cache.fill([self.scene.frames[i].image for i in used], workers=self.workers)
+        images = [self.scene.frames[i].image for i in used]
+        if scheduler is not None:
+            return fill_on_cluster(self.cache, images, scheduler, self.workers)
+        return self.cache.fill(images, workers=self.workers)
 
     def dataset(self, split: str) -> PoseDataset:
         """One of `train`, `val`, `test`, its features in memory."""

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from lightning_pose.errors import ConfigError, ImageError
+from lightning_pose.features.array_files import allocate_rows
 from lightning_pose.features.base import FeatureExtractor, Record
 from lightning_pose.features.fill_job import FillJob, ImagePath, Visit, count_cores, hash_bytes
 from lightning_pose.features.record_files import TEMPORARY, write_file_atomically
@@ -93,12 +94,13 @@ class FeatureCache:
     def features(self, paths: Sequence[ImagePath], workers: int | None = None, progress: bool = True) -> np.ndarray:
         """The features that networks read, (len(paths), *extractor.feature_shape) of `extractor.dtype`.
 
+        More than a gibibyte of them is mapped from a temporary file in the cache's folder instead of held in memory.
         What the cache lacks is extracted first; arguments and errors are those of `fill`.
 
         Raises:
             ImageError: also where features are not finite numbers.
         """
-        rows = np.empty((len(paths), *self.extractor.feature_shape), self.extractor.dtype)
+        rows = allocate_rows((len(paths), *self.extractor.feature_shape), self.extractor.dtype, self.folder)
         bad: list[int] = []
 
         def put(numbers: list[int], record: Record) -> None:

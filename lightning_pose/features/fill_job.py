@@ -24,7 +24,7 @@ from lightning_pose.features.base import FeatureExtractor, Record
 from lightning_pose.features.record_files import DamagedError, read_record, write_record
 from lightning_pose.scenes.images import decode_image, read_bytes
 
-__all__ = ["FillJob", "ImagePath", "Visit", "count_cores", "hash_bytes"]
+__all__ = ["FillJob", "ImagePath", "Visit", "count_cores", "hash_bytes", "make_extraction_bar"]
 
 ImagePath = Path | str
 Visit = Callable[[list[int], Record], None]
@@ -90,7 +90,7 @@ class FillJob:
         size = min(BATCH, -(-len(todo) // self.workers))
         batches = [todo[start : start + size] for start in range(0, len(todo), size)]
         workers = min(self.workers, len(batches))
-        with _make_extraction_bar(progress) as bar, _set_inner_threads(max(1, self.workers // workers)):
+        with make_extraction_bar(progress) as bar, _set_inner_threads(max(1, self.workers // workers)):
             task = bar.add_task(f"{self.extractor.name} features", total=len(todo))
             pool = ThreadPoolExecutor(workers)
             try:
@@ -177,7 +177,7 @@ class _RateColumn(ProgressColumn):
         return Text(f"{task.speed:.1f} images/s" if task.speed else "", style="progress.data.speed")
 
 
-def _make_extraction_bar(shown: bool) -> Progress:
+def make_extraction_bar(shown: bool) -> Progress:
     """A progress bar on stderr, with images per second."""
     return Progress(
         TextColumn("{task.description}", markup=False),

@@ -16,12 +16,8 @@ from lightning_pose.geometry.quaternions import align_hemisphere
 from lightning_pose.models.base import PoseModule
 from lightning_pose.models.parts.graph_conv import GraphConvolution, PoseHeads
 from lightning_pose.models.parts.memory import TrainingMemory
-from lightning_pose.models.parts.neighbour_graph import (
-    find_neighbourhood,
-    list_edges,
-    sample_neighbours,
-    search_neighbours,
-)
+from lightning_pose.models.parts.neighbour_graph import list_edges, sample_neighbours
+from lightning_pose.models.parts.neighbour_index import NeighbourIndex
 
 __all__ = ["NodePose"]
 
@@ -55,9 +51,10 @@ class NodePose(TrainingMemory, PoseModule):
         slope: see above.
         gap: training images are joined only if their places in the scene are at least this many frames apart; 1
             joins all, as the thesis does.
-        full_graph_limit: up to this many training images every step computes the whole graph; with more, the part
-            that the batch depends on.
-        fanout: in that part, draw so many neighbours of each node at random, where their mean stands for that of all:
+        full_graph_limit: up to this many training images every step computes the whole graph. With more, it computes
+            the batch alone, which receives what its neighbours' states were when they were last computed, in this epoch
+            or at its start (Fey et al., GNNAutoScale, ICML 2021). So an epoch's time is in proportion to the images.
+        fanout: in such steps, draw so many neighbours of each node at random, where their mean stands for that of all:
             with `aggr: mean` of `wl` and SAGEConv. The sum or the maximum of a few is not that of all, which
             validation and use compute; so other convolutions read every neighbour.
         **kwargs: what `PoseModule` takes.
@@ -113,6 +110,8 @@ class NodePose(TrainingMemory, PoseModule):
         self.register_buffer("memory_table", torch.zeros(0, neighbours, dtype=torch.int64))
         self.register_load_state_dict_post_hook(_forget_states)
         self._memory: _Memory | None = None
+        self._index: NeighbourIndex | None = None
+        self._history: list[Tensor] | None = None
 
     @property
     def headline(self) -> str:
@@ -132,13 +131,13 @@ class NodePose(TrainingMemory, PoseModule):
         self.memory_features = train.features
         self.memory_pose = (pose - self.pose_mean) / self.pose_scale
         self.memory_frame = train.frame
-        keys = self._to_keys(train.features)
-        self.memory_table = search_neighbours(keys, keys, self.neighbours, train.frame, train.frame, self.gap)
-        self.forget_states()
+        self.forget_features()
+        index = self._find_index()
+        self.memory_table = index.search(index.reference, self.neighbours, train.frame, train.frame, self.gap)
 
     def decode_features(self, features: Tensor) -> tuple[Tensor, Tensor]:
         memory = self.compute_memory()
-        table = search_neighbours(self._to_keys(features), memory.keys, self.neighbours)
+        table = self._find_index().search(self._to_keys(features), self.neighbours)
         pose = self.network(self.standardize_input(features), memory.states, table)
         if self.neighbour_poses:
             pose = self.slope * pose + _average_neighbours(memory.offset, table[:, : self.neighbour_poses])
@@ -149,29 +148,60 @@ class NodePose(TrainingMemory, PoseModule):
             return self.decode_features(batch.features)
         self.forget_states()  # weights are about to change
         rows, table = torch.searchsorted(self.memory_frame, batch.frame), self.memory_table
-        features = self.memory_features
         if len(table) > self.full_graph_limit:
-            if self.network.takes_means:
-                table = sample_neighbours(table, self.fanout)
-            nodes, table, rows = find_neighbourhood(table, rows, hops=len(self.network.convolutions))
-            features = features[nodes]
-        *_, last = self.network.compute_states(self.standardize_input(features), table)
-        answer = self.network.convolve(len(self.network.convolutions) - 1, last[rows], last, table[rows])
+            answer = self._convolve_batch(rows, table[rows])
+        else:
+            *_, last = self.network.compute_states(self.standardize_input(self.memory_features), table)
+            answer = self.network.convolve(len(self.network.convolutions) - 1, last[rows], last, table[rows])
         return self.unscale_pose(self.network.heads(answer))
+
+    def _convolve_batch(self, rows: Tensor, table: Tensor) -> Tensor:
+        """(B, C) last states of training images, from those that their neighbours (B, K) were left in."""
+        if self.network.takes_means:
+            table = sample_neighbours(table, self.fanout)
+        if self._history is None:
+            self.network.eval()  # without dropout
+            with torch.no_grad():
+                self._history = self.network.compute_states(
+                    self.standardize_input(self.memory_features), self.memory_table
+                )
+            self.network.train()
+        target = self._history[0][rows]
+        for layer, source in enumerate(self._history):
+            target = self.network.convolve(layer, target, source, table)
+            if layer + 1 < len(self._history):
+                self._history[layer + 1][rows] = target.detach()
+        return target
+
+    def on_train_epoch_start(self) -> None:
+        super().on_train_epoch_start()
+        self._history = None
+
+    def forget_features(self) -> None:
+        """Drop all that was computed from the training images; it is computed again when next needed."""
+        self._index = self._history = None
+        self.forget_states()
 
     def forget_states(self) -> None:
         """Drop the training images' states; they are computed again when next needed."""
         self._memory = None
 
     def compute_memory(self) -> _Memory:
-        """What queries are compared with and what they receive, computed when first needed."""
-        if self._memory is None or self._memory.keys.device != self.device:
+        """What queries receive, computed when first needed."""
+        if self._memory is None or self._memory.offset.device != self.device:
             with torch.inference_mode(False), torch.no_grad():
                 states = self.network.compute_states(self.standardize_input(self.memory_features), self.memory_table)
                 answer = self.network.heads(self.network.convolve_all(len(states) - 1, states[-1], self.memory_table))
                 offset = self.memory_pose - self.slope * answer
-                self._memory = _Memory(self._to_keys(self.memory_features), states, offset)
+                self._memory = _Memory(states, offset)
         return self._memory
+
+    def _find_index(self) -> NeighbourIndex:
+        """What queries are compared with, made when first needed."""
+        if self._index is None or self._index.reference.device != self.device:
+            with torch.inference_mode(False), torch.no_grad():
+                self._index = NeighbourIndex(self._to_keys(self.memory_features))
+        return self._index
 
     def _to_keys(self, features: Tensor) -> Tensor:
         """What distances are measured between, (B, D)."""
@@ -185,19 +215,17 @@ class NodePose(TrainingMemory, PoseModule):
 def _forget_states(module: nn.Module, _: object) -> None:
     """`load_state_dict` calls this once the weights have changed."""
     assert isinstance(module, NodePose)
-    module.forget_states()
+    module.forget_features()
 
 
 class _Memory(NamedTuple):
     """What queries need of N training images.
 
     Attributes:
-        keys: (N, D) that queries are compared with.
         states: (N, C) that each convolution receives.
         offset: (N, 7), the scaled pose less the slope's part of the network's answer.
     """
 
-    keys: Tensor
     states: list[Tensor]
     offset: Tensor
 

@@ -1,4 +1,11 @@
-"""Runs the trials of a sweep: in this process, or in several that share the study and are replaced if killed."""
+"""Runs the trials of a sweep: in this process, in several that share the study, or on a cluster.
+
+The processes of one machine are not those of `run_tasks`: trials need what its engines do not have (joblib 1.6,
+distributed 2026.8). Where one process of joblib is killed, joblib ends the others in the middle of their trials.
+Workers of Dask call tasks outside their main thread, which no Ctrl-C or SIGTERM reaches, so that a trial under way
+could neither be recorded as interrupted nor be queued again; and those that Dask starts for a command end with it, and
+not with their trials.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +13,7 @@ import multiprocessing
 import os
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
@@ -29,11 +37,14 @@ from lightning_pose.sweeps.plan import Plan
 from lightning_pose.sweeps.storage import lock_study
 from lightning_pose.sweeps.study import count_waiting, is_grid, load_study, open_storage, queue_again, recover_trials
 from lightning_pose.sweeps.trial import run_trial
+from lightning_pose.tasks import run_tasks
 
-__all__ = ["Job", "run_here", "run_in_processes", "run_next_trial"]
+__all__ = ["Job", "run_here", "run_in_processes", "run_next_trial", "run_on_cluster"]
 
 PATIENCE_SECONDS, POLL_SECONDS = 20.0, 0.5
 INTERRUPTED = 130
+ONE_TRIAL = threading.Lock()
+"""Trials seed the generators of their whole process, so that workers of a cluster with several threads take turns."""
 
 
 @dataclass(frozen=True)
@@ -192,6 +203,36 @@ def run_in_processes(job: Job, total: int, on_end: Callable[[], None], workers: 
     except KeyboardInterrupt:
         _interrupt_workers(running)
         raise
+
+
+def run_on_cluster(job: Job, total: int, on_end: Callable[[], None], workers: int, scheduler: str) -> None:
+    """Run this many trials on the workers of a Dask cluster; fewer where a grid has no more.
+
+    A trial whose worker is killed is queued again by the next task on that machine, or once it has had no heartbeat for
+    a minute. After Ctrl-C, trials under way are finished by their workers.
+
+    Args:
+        job: what to run.
+        total: number of trials.
+        on_end: called after each.
+        workers: as for `run_tasks`.
+        scheduler: likewise.
+
+    Raises:
+        ConfigError: as `run_tasks`.
+    """
+    for _, ran in run_tasks(_run_task, [job] * total, workers, scheduler):
+        if ran:
+            on_end()
+
+
+def _run_task(job: Job) -> bool:
+    """Run one trial in a worker of a cluster; returns False if no grid point is waiting."""
+    with ONE_TRIAL:
+        study, storage = job.open()
+        with lock_study(storage, job.study):
+            recover_trials(study, storage, MlflowClient(job.plan.tracking[0]))
+        return run_next_trial(study, storage, job)
 
 
 def _run_worker(job: Job, left: Semaphore, ended: Semaphore) -> None:

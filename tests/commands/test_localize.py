@@ -16,6 +16,7 @@ import pytest
 from lightning_pose.__main__ import main
 from lightning_pose.localization.localizer import Localizer
 from lightning_pose.localization.located_pose import stack_poses
+from lightning_pose.localization.parallel import ModelSource, locate_files
 from tests.helpers import REPOSITORY, Trained
 from tests.rooms import MappedRoom, write_video
 
@@ -151,6 +152,7 @@ def test_without_rerun_one_line_says_what_to_install(
         (["*.nothing"], "*.nothing matches no file"),
         (["{room}"], "has no images; give one of its folders, such as "),
         (["{image}", "--every", "0"], "--every is 0; give 1"),
+        (["{image}", "--workers", "0"], "--workers is 0; give 1"),
         (["{image}", "--camera", "PINHOLE,1"], "camera 'PINHOLE,1' does not have the form"),
         (["{image}", "--out", "{image}/x.csv"], "cannot be written"),
         (["{image}", "--format", "xml"], "invalid choice: 'xml'"),
@@ -184,6 +186,25 @@ def test_a_network_locates_and_refuses_a_camera(
     options = "--allow", "tests", "--camera", "PINHOLE,64,48,50,50,31.5,23.5"
     localize(trained.best, images, *options, expected=2)
     assert "SurfLSTM does not use cameras; leave camera out" in capsys.readouterr().err
+
+
+def test_several_images_at_once_give_the_same_lines(
+    trained: Trained, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("lightning_pose.localization.parallel.PER_TASK", 3)
+    images = sorted((scene / "seq-03").glob("*.png"))
+    paths = [*map(str, images[:5]), str(tmp_path / "gone.png"), *map(str, images[5:])]
+    monkeypatch.setattr("sys.stdin", io.StringIO("\n".join(paths)))
+    options = "--allow", "tests", "--format", "csv", "--out", tmp_path / "many.csv"
+    localize(trained.best, "-", *options, "--workers", 3, expected=1)
+    rows = list(csv.DictReader((tmp_path / "many.csv").open(newline="")))
+    assert [row["image"] for row in rows] == paths
+    assert [row["status"] for row in rows].index("refused") == 5
+    alone = Localizer.load(trained.best, ["tests"]).localize(images)
+    again = [pose for pose in locate_files(ModelSource(str(trained.best), ("tests",)), None, paths, 2) if pose.accepted]
+    np.testing.assert_allclose(stack_poses(again)[0], stack_poses(alone)[0], atol=1e-6)
+    found = np.array([[float(row[name]) for name in ("x_m", "y_m", "z_m")] for row in rows if row["x_m"]])
+    np.testing.assert_allclose(found, stack_poses(alone)[0], atol=1e-6)
 
 
 def test_the_entry_point_stops_at_a_closed_pipe(mapped_room: MappedRoom, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Graphs of nearest neighbours: the search, its edges, and the part of a graph that some nodes' states depend on.
+"""Graphs of nearest neighbours: the search, the edges, and a sample of them.
 
 A graph is a table (N, K) of int64: row i holds the neighbours of node i, nearest first, and `ABSENT` in
 the places that stay empty.
@@ -11,7 +11,6 @@ from torch import Tensor
 
 __all__ = [
     "ABSENT",
-    "find_neighbourhood",
     "list_edges",
     "sample_neighbours",
     "search_neighbours",
@@ -93,30 +92,3 @@ def sample_neighbours(table: Tensor, count: int) -> Tensor:
     """
     places = torch.rand(table.shape, device=table.device).topk(min(count, table.shape[1]), dim=1).indices
     return table.gather(1, places)
-
-
-def find_neighbourhood(table: Tensor, seeds: Tensor, hops: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Cut out the part of a graph on which the states of some nodes depend after as many convolutions.
-
-    PyG's NeighborLoader does this with compiled packages (pyg-lib, torch-sparse) that torch-geometric does not
-    bring along; a table needs no more than indexing.
-
-    Args:
-        table: (N, K) the whole graph.
-        seeds: (B,) the nodes.
-        hops: how many convolutions.
-
-    Returns:
-        nodes: (M,) the nodes of that part; the other two results number them 0 to M - 1.
-        table: (M, K) their graph; neighbours outside the part are absent.
-        seeds: (B,).
-    """
-    kept = torch.zeros(len(table), dtype=torch.bool, device=table.device)
-    kept[seeds] = True
-    for _ in range(hops):
-        reached = table[kept].flatten()
-        kept[reached[reached != ABSENT]] = True
-    nodes = kept.nonzero().squeeze(1)
-    number = torch.full((len(table) + 1,), ABSENT, device=table.device)  # the last one is that of absent nodes
-    number[nodes] = torch.arange(len(nodes), device=table.device)
-    return nodes, number[table[nodes]], number[seeds]

@@ -7,7 +7,7 @@ looks at, z up; metres.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import cv2
@@ -15,8 +15,9 @@ import numpy as np
 
 from lightning_pose.scenes.synthetic import textures
 from lightning_pose.scenes.synthetic.posters import paint_poster
+from lightning_pose.scenes.synthetic.sessions import Session, make_session, move_furniture
 
-__all__ = ["TEXELS_PER_M", "Quad", "Room", "make_room"]
+__all__ = ["TEXELS_PER_M", "Quad", "Room", "make_room", "measure_room"]
 
 TEXELS_PER_M = 256
 """Pixels of a texture per metre."""
@@ -59,17 +60,30 @@ class Room:
     size_m: np.ndarray
 
 
-def make_room(seed: int) -> Room:
-    """Make the room of a seed, which chooses dimensions, surfaces, furniture, pictures and lamps."""
+def make_room(seed: int, session: int = 0) -> Room:
+    """Make the room of a seed, which chooses dimensions, surfaces, furniture, pictures and lamps, as at a visit."""
     rng = np.random.default_rng([seed, 0])
-    size = rng.uniform((5.4, 3.8, 2.5), (6.6, 4.4, 2.9))
+    size = _draw_size(rng)
     boxes = _place_furniture(rng, size)
     lamps = np.array([(-size[0] / 4, 0.1, size[2] - 0.15), (size[0] / 4, -0.3, size[2] - 0.15)])
     lamps += rng.uniform(-0.5, 0.5, (2, 3)) * (1, 1, 0)
     bare = [*_make_shell(rng, size), *_hang_pictures(rng, size)]
-    for box in boxes:
-        bare += _make_box_faces(rng, *box)
-    return Room(tuple(_bake_light(quad, size, np.array(boxes), lamps) for quad in bare), size)
+    shift_m, kept = move_furniture(seed, session, size, np.array(boxes))
+    for box, shift, there in zip(boxes, shift_m, kept, strict=True):
+        faces = list(_make_box_faces(rng, *box))  # painted before they move, so that the same box looks the same
+        bare += [replace(face, corner=face.corner + shift) for face in faces if there]
+    solid = (np.array(boxes) + shift_m[:, None])[kept]
+    light = make_session(seed, session)
+    return Room(tuple(_bake_light(quad, size, solid, lamps + light.lamp_shift_m, light) for quad in bare), size)
+
+
+def measure_room(seed: int) -> np.ndarray:
+    """The extent (3,) of the room of a seed along x, y and z in metres, without making it."""
+    return _draw_size(np.random.default_rng([seed, 0]))
+
+
+def _draw_size(rng: np.random.Generator) -> np.ndarray:
+    return rng.uniform((5.4, 3.8, 2.5), (6.6, 4.4, 2.9))
 
 
 def _make_face(
@@ -167,8 +181,8 @@ def _make_box_faces(rng: np.random.Generator, low: np.ndarray, high: np.ndarray)
     yield _make_face(rng, top, np.array([middle[0], middle[1], high[2]]), "+z", w, d)
 
 
-def _bake_light(quad: Quad, size: np.ndarray, boxes: np.ndarray, lamps: np.ndarray) -> Quad:
-    """Multiply a rectangle's texture by its light: two lamps with soft shadows, and darker corners.
+def _bake_light(quad: Quad, size: np.ndarray, boxes: np.ndarray, lamps: np.ndarray, session: Session) -> Quad:
+    """Multiply a rectangle's texture by a visit's light: two lamps with soft shadows, and darker corners.
 
     The light is computed on a grid of about 8 points a metre and interpolated.
     """
@@ -178,15 +192,17 @@ def _bake_light(quad: Quad, size: np.ndarray, boxes: np.ndarray, lamps: np.ndarr
     normal = np.cross(quad.v, quad.u)
     normal /= np.linalg.norm(normal)
     points = quad.corner + s[..., None] * quad.u + t[..., None] * quad.v
-    light = 0.45 * _compute_openness(points + 0.1 * normal, size, boxes)
+    light = session.ambient * _compute_openness(points + 0.1 * normal, size, boxes)
     softness = 0.25 * np.array([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0)])
     rays = (lamps[:, None] + softness).reshape(-1, 3) - points[..., None, :]
     distance = np.linalg.norm(rays, axis=-1)
     incidence = np.clip((rays @ normal) / distance, 0, 1)
     reaches = ~_find_blocked(points[..., None, :] + 0.01 * normal, rays, boxes)
-    light += (0.145 * reaches * incidence / (0.35 + 0.1 * distance**2)).sum(-1)
+    power = np.repeat(0.145 * np.broadcast_to(session.lamp_power, 2), len(softness))
+    light += (power * reaches * incidence / (0.35 + 0.1 * distance**2)).sum(-1)
     shade = cv2.resize(light.astype(np.float32), (w, h), interpolation=cv2.INTER_LINEAR)
-    return Quad(quad.corner, quad.u, quad.v, textures.shade_image(quad.texture, shade))
+    tinted = shade[..., None] * np.broadcast_to(session.tint, 3).astype(np.float32)
+    return replace(quad, texture=textures.shade_image(quad.texture, tinted))
 
 
 def _compute_openness(points: np.ndarray, size: np.ndarray, boxes: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-__all__ = ["Walk", "is_test", "make_walks"]
+__all__ = ["Walk", "is_test", "make_visit", "make_walks"]
 
 FRAMES_PER_KNOT = 8
 STEP_M = 0.3
@@ -68,10 +68,8 @@ def make_walks(seed: int, size_m: np.ndarray, lengths: list[int]) -> list[Walk]:
     and in the point looked at, so that they cover the volume. Test walks stay at `ASIDE_M` from the nearest of these.
     """
     rng = np.random.default_rng([seed, 1])
-    near, far = -size_m[1] / 2 + 0.4, size_m[1] / 2
-    low = np.array([-1.5, near, 1.1, -0.8, far, 1.0])
-    high = np.array([1.5, near + 2, 1.7, 0.8, far, 1.7])
-    counts = [length // FRAMES_PER_KNOT + 5 for length in lengths]
+    low, high = _find_bounds(size_m)
+    counts = [_count_knots(length) for length in lengths]
     knots: dict[int, np.ndarray] = {}
     seen = np.zeros((0, 6))
     for held_out in (False, True):
@@ -80,6 +78,24 @@ def make_walks(seed: int, size_m: np.ndarray, lengths: list[int]) -> list[Walk]:
                 knots[i] = _choose_knots(rng, low, high, counts[i], seen, ASIDE_M if held_out else FAR_M)
                 seen = seen if held_out else np.concatenate([seen, knots[i]])
     return [_make_walk(rng, knots[i], length) for i, length in enumerate(lengths)]
+
+
+def make_visit(seed: int, size_m: np.ndarray, session: int, length: int) -> Walk:
+    """Make one walk through the volume of `make_walks` that does not depend on those of other visits."""
+    rng = np.random.default_rng([seed, 1, session])
+    knots = _choose_knots(rng, *_find_bounds(size_m), _count_knots(length), np.zeros((0, 6)), FAR_M)
+    return _make_walk(rng, knots, length)
+
+
+def _find_bounds(size_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest (6,) position and target of a knot."""
+    near, far = -size_m[1] / 2 + 0.4, size_m[1] / 2
+    return np.array([-1.5, near, 1.1, -0.8, far, 1.0]), np.array([1.5, near + 2, 1.7, 0.8, far, 1.7])
+
+
+def _count_knots(length: int) -> int:
+    """How many knots a walk of so many frames takes."""
+    return length // FRAMES_PER_KNOT + 5
 
 
 def _make_walk(rng: np.random.Generator, knots: np.ndarray, length: int) -> Walk:

@@ -1,4 +1,4 @@
-"""Graphs of nearest neighbours: known neighbours, bounded memory, edges, and the parts that nodes depend on."""
+"""Graphs of nearest neighbours: known neighbours, bounded memory, edges and samples."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import torch
 
 from lightning_pose.models.parts.neighbour_graph import (
     ABSENT,
-    find_neighbourhood,
     list_edges,
     sample_neighbours,
     search_neighbours,
@@ -71,11 +70,3 @@ def test_a_sample_holds_different_neighbours_of_the_node() -> None:
         assert len(set(drawn.tolist())) == 4
         assert set(drawn.tolist()) <= set(row.tolist())
     assert sample_neighbours(table, 99).sort().values.equal(table)
-
-
-def test_a_neighbourhood_is_what_its_seeds_depend_on() -> None:
-    chain = torch.tensor([[1], [2], [3], [4], [ABSENT], [0]])  # from 1 to 0, from 2 to 1, ...; from 0 to 5
-    nodes, table, seeds = find_neighbourhood(chain, torch.tensor([1, 0]), hops=2)
-    assert nodes.tolist() == [0, 1, 2, 3]
-    assert table.tolist() == [[1], [2], [3], [ABSENT]]
-    assert seeds.tolist() == [1, 0]

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from lightning_pose.errors import ConfigError, DataError
+from lightning_pose.scenes.formats import load_scene
 from lightning_pose.scenes.synthetic import dataset, render_room
 from lightning_pose.scenes.synthetic.dataset import divide_frames
 from lightning_pose.scenes.synthetic.trajectory import is_test, make_walks
@@ -79,6 +80,22 @@ def test_an_equal_room_is_kept(room: Path) -> None:
     assert render_room(room, 0, FRAMES, SIZE, lambda done, total: calls.append(done)) == room
     assert not calls
     assert (room / "seq-01" / "frame-000000.color.png").stat().st_mtime_ns == before
+
+
+@pytest.mark.usefixtures("built_once")
+def test_each_session_is_a_sequence_and_the_last_one_tests(tmp_path: Path) -> None:
+    root = render_room(tmp_path / "room", 0, 7, (64, 48), sessions=2)
+    scene = load_scene(root, val_fraction=0)
+    assert [frame.sequence for frame in scene.frames] == ["seq-01"] * 4 + ["seq-02"] * 3
+    assert [scene.splits[split].tolist() for split in ("train", "test")] == [[0, 1, 2, 3], [4, 5, 6]]
+    other = load_scene(root, val_fraction=0, split="folders:seq-01")
+    assert other.splits["test"].tolist() == [0, 1, 2, 3]
+    first, last = (
+        np.array([f.position_m for f in scene.frames if f.sequence == name]) for name in ("seq-01", "seq-02")
+    )
+    assert np.linalg.norm(first[:, None] - last, axis=-1).min() > 0.05, "walks of their own"
+    tints = [np.asarray(cv2.imread(str(scene.frames[i].image))).mean((0, 1)) for i in (0, 4)]
+    assert np.abs(tints[0] / tints[1] - 1).max() > 0.05
 
 
 def test_something_else_is_never_overwritten(room: Path, tmp_path: Path) -> None:
