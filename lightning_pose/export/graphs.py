@@ -122,6 +122,7 @@ class _Radius(nn.Module):
         super().__init__()
         for name in ("signs", "mean", "reference", "floor"):
             self.register_buffer(name, getattr(radius, name).float())
+        self.register_buffer("lift", radius.lift)
         self.factors = [factor or float("nan") for factor in radius.factors.tolist()]
         self.farthest = (radius.limit or float("nan")) * (float(radius.farthest) or float("nan"))
         self.pools: tuple[Tensor, Tensor] | None = None
@@ -133,11 +134,12 @@ class _Radius(nn.Module):
     mean: Tensor
     reference: Tensor
     floor: Tensor
+    lift: Tensor | None
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         features = features.float()
         if features.ndim == 3:
-            features = features.sum(1)
+            features = features.sum(1) if self.lift is None else (features @ self.lift).relu().sum(1)
         elif features.ndim == 4:
             features = features.mean((2, 3)) if self.pools is None else self.pools[0] @ features @ self.pools[1]
         keys = (F.normalize(features.flatten(1), dim=1) - self.mean) @ self.signs

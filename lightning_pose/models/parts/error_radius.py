@@ -17,6 +17,9 @@ DIMENSIONS = 128
 MOST = 1000
 """Training images that are kept, evenly spaced."""
 
+LIFTED = 256
+"""Random projections of each descriptor, whose positive parts are added: plain sums do not tell noise from a room."""
+
 CELLS = 8
 """Pixels of an image are averaged over so many rows and columns."""
 
@@ -47,12 +50,15 @@ class ErrorRadius(nn.Module):
     factors: Tensor
     farthest: Tensor
     signs: Tensor
+    lift: Tensor | None
 
     def __init__(self, input_shape: tuple[int, ...], limit: float | None = None) -> None:
         super().__init__()
         self.input_shape = input_shape
         self.limit = limit
-        width = _pool_features(torch.zeros(1, *input_shape)).shape[1]
+        lift = _make_signs(input_shape[-1], LIFTED, seed=1) if len(input_shape) == 2 else None
+        self.register_buffer("lift", lift, persistent=False)
+        width = self._pool(torch.zeros(1, *input_shape)).shape[1]
         self.register_buffer("signs", _make_signs(width, DIMENSIONS), persistent=False)
         self.register_buffer("reference", torch.zeros(0, DIMENSIONS, dtype=torch.float16))
         self.register_buffer("mean", torch.zeros(width))
@@ -65,13 +71,13 @@ class ErrorRadius(nn.Module):
     def set_training(self, features: Tensor) -> None:
         """Keep (M, *input_shape) features of training images, in few numbers each."""
         kept = torch.linspace(0, len(features) - 1, min(MOST, len(features))).round().long()
-        pooled = torch.cat([_pool_features(chunk) for chunk in features[kept].split(64)]).to(self.mean)
+        pooled = torch.cat([self._pool(chunk) for chunk in features[kept].split(64)]).to(self.mean)
         self.mean = pooled.mean(0)
         self.reference = ((pooled - self.mean) @ self.signs).half()
 
     def measure_distance(self, features: Tensor) -> Tensor:
         """(B,) distances of (B, *input_shape) features to the nearest training image."""
-        keys = (_pool_features(features).to(self.mean) - self.mean) @ self.signs
+        keys = (self._pool(features).to(self.mean) - self.mean) @ self.signs
         return torch.cdist(keys.float(), self.reference.float()).amin(1)
 
     def add_errors(self, features: Tensor, position_error: Tensor, orientation_error_deg: Tensor) -> None:
@@ -111,29 +117,32 @@ class ErrorRadius(nn.Module):
         return (self.measure_distance(features) / (self.limit * self.farthest)).cpu()
 
     def resize(self, state_dict: dict[str, Tensor]) -> None:
-        """Make room for the training images of a state dict; an older version kept fewer numbers of each."""
-        reference = state_dict.get("reference")
+        """Make room for the training images of a state dict; older versions kept fewer numbers, of plain sums."""
+        reference, mean = state_dict.get("reference"), state_dict.get("mean")
+        if mean is not None and mean.ndim == 1 and len(self.input_shape) == 2:
+            plain = len(mean) == self.input_shape[1]
+            self.lift = None if plain else _make_signs(self.input_shape[1], LIFTED, seed=1).to(self.mean)
+            self.mean = self.mean.new_zeros(len(mean))
         if reference is not None and reference.ndim == 2:
             self.reference = torch.zeros_like(reference, device=self.mean.device)
             self.signs = _make_signs(len(self.mean), reference.shape[1]).to(self.mean)
 
+    def _pool(self, features: Tensor) -> Tensor:
+        """(B, D) unit vectors of features (B, D), of keypoints (B, N, D), of maps or images of few channels (B, C, H, W)."""
+        features = features.float()
+        if features.ndim == 3:
+            features = features.sum(1) if self.lift is None else (features @ self.lift.to(features)).relu().sum(1)
+        elif features.ndim == 4:
+            small = features.shape[1] <= 4
+            features = F.adaptive_avg_pool2d(features, CELLS if small else 1).flatten(1)
+        return F.normalize(features, dim=1)
 
-def _make_signs(width: int, dimensions: int) -> Tensor:
+
+def _make_signs(width: int, dimensions: int, seed: int = 0) -> Tensor:
     """(width, dimensions), a random projection that keeps distances, the same for ever."""
-    bits = np.random.PCG64(0).random_raw(-(-width * dimensions // 64)).view(np.uint8)
+    bits = np.random.PCG64(seed).random_raw(-(-width * dimensions // 64)).view(np.uint8)
     signs = np.unpackbits(bits)[: width * dimensions].reshape(width, dimensions).astype(np.float32) * 2 - 1
     return torch.from_numpy(signs / np.float32(dimensions**0.5))
-
-
-def _pool_features(features: Tensor) -> Tensor:
-    """(B, D) unit vectors of features (B, D), (B, N, D) of keypoints, (B, C, H, W) maps, or images of few channels."""
-    features = features.float()
-    if features.ndim == 3:
-        features = features.sum(1)
-    elif features.ndim == 4:
-        small = features.shape[1] <= 4
-        features = F.adaptive_avg_pool2d(features, CELLS if small else 1).flatten(1)
-    return F.normalize(features, dim=1)
 
 
 def _fit_before_load(module: nn.Module, state_dict: dict[str, Tensor], prefix: str, *_: object) -> None:

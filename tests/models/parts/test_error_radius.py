@@ -76,6 +76,23 @@ def test_images_beyond_the_limit_are_refused(calibrated: ErrorRadius) -> None:
         LinearPoseNet(input_shape=[32], distance_limit=0)
 
 
+def test_a_checkpoint_of_plain_sums_answers_as_it_did() -> None:
+    features = torch.rand(12, 20, 64, generator=torch.Generator().manual_seed(0))
+    older = ErrorRadius((20, 64))
+    older.lift, older.mean = None, torch.zeros(64)
+    older.signs = torch.eye(64)[:, :16]
+    older.set_training(features[:8])
+    state = {**older.state_dict(), "reference": older.reference.float()}
+    model = ErrorRadius((20, 64))
+    model.load_state_dict(state)
+    assert model.lift is None
+    assert model.signs.shape == (64, 16)
+    model.signs = older.signs
+    torch.testing.assert_close(model.measure_distance(features), older.measure_distance(features))
+    model.load_state_dict(ErrorRadius((20, 64)).state_dict())
+    assert model.lift is not None
+
+
 @pytest.mark.parametrize("shape", [(32,), (20, 64), (16, 7, 7), (3, 24, 24)])
 def test_it_measures_any_layout(shape: tuple[int, ...]) -> None:
     radius = ErrorRadius(shape)
