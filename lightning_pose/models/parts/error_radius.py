@@ -128,7 +128,7 @@ class ErrorRadius(nn.Module):
             self.signs = _make_signs(len(self.mean), reference.shape[1]).to(self.mean)
 
     def _pool(self, features: Tensor) -> Tensor:
-        """(B, D) unit vectors of features (B, D), of keypoints (B, N, D), of maps or images of few channels (B, C, H, W)."""
+        """(B, D) unit vectors of features (B, D), of keypoints (B, N, D), of maps or of images (B, C, H, W)."""
         features = features.float()
         if features.ndim == 3:
             features = features.sum(1) if self.lift is None else (features @ self.lift.to(features)).relu().sum(1)
