@@ -191,8 +191,9 @@ class _NodeDecoder(nn.Module):
         super().__init__()
         memory = model.compute_memory()
         self.model = model
-        self.k = min(model.neighbours, len(memory.keys))
-        self.register_buffer("keys", memory.keys.clone())
+        keys = F.normalize(model.memory_features, dim=-1) if model.normalize else model.memory_features
+        self.k = min(model.neighbours, len(keys))
+        self.register_buffer("keys", keys.clone())
         self.register_buffer("offset", memory.offset.clone())
         for i, states in enumerate(memory.states):
             self.register_buffer(f"states_{i}", states.clone())

@@ -141,13 +141,13 @@ def test_weights_of_eight_bits_answer_almost_the_same(name: str, tmp_path: Path)
     assert small.stat().st_size < 0.5 * whole.stat().st_size
     if clips:
         given = torch.rand(1, 4, 12, 68).numpy()
-        answers = [np.concatenate(Network(file).locate_clip(given), axis=1) for file in (whole, small)]
+        before, after = (np.concatenate(Network(file).locate_clip(given), axis=1) for file in (whole, small))
     else:
         given = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
         found = [Network(file).locate(given) for file in (whole, small)]
-        answers = [np.concatenate([pose.position_m - 1e6 * np.eye(3)[0], pose.quat_wxyz]) for pose in found]
-    assert not np.array_equal(*answers)
-    np.testing.assert_allclose(*answers, atol=0.03)
+        before, after = (np.concatenate([pose.position_m - 1e6 * np.eye(3)[0], pose.quat_wxyz]) for pose in found)
+    assert not np.array_equal(before, after)
+    np.testing.assert_allclose(before, after, atol=0.03)
 
 
 @pytest.mark.parametrize("name", CLIPS)
