@@ -107,7 +107,7 @@ def _evaluate_radius(module: PoseModule, prediction: Pose, scene: Scene, test: P
         orientation_error_deg(prediction.quat_wxyz.double(), test.quat_wxyz.double()).numpy(),
     )
     accepted = ~module.find_refused(test)
-    metrics, rows = measure_accepted(errors, accepted)
+    metrics, rows = measure_accepted(errors, accepted) if module.radius.has_limit else ({}, {})
     if accepted.all():
         rows = {}  # the same as all frames
     errors, radii = ((each[0][accepted], each[1][accepted]) for each in (errors, radii))

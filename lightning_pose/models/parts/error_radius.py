@@ -110,9 +110,14 @@ class ErrorRadius(nn.Module):
         position, orientation = (factor or np.nan for factor in self.factors.tolist())
         return scale * position, scale * orientation
 
+    @property
+    def has_limit(self) -> bool:
+        """Whether images can be too far: a limit is set, and the farthest validation frame is known."""
+        return bool(self.limit and self.farthest > 0)
+
     def measure_excess(self, features: Tensor) -> Tensor:
         """(B,) distances by the largest that is accepted, so that above 1 is refused; nan where that is unknown."""
-        if not (self.limit and self.farthest > 0):
+        if not self.has_limit:
             return torch.full((len(features),), torch.nan)
         return (self.measure_distance(features) / (self.limit * self.farthest)).cpu()
 
