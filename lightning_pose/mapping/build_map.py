@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,12 +31,15 @@ from lightning_pose.mapping.tracks import join_tracks
 __all__ = [
     "GATES_PX",
     "MappedFrames",
+    "PointSums",
     "Tracks",
     "add_frames",
     "adjust_mapped",
     "build_point_map",
+    "find_tracks",
     "map_frames",
     "roll_mapped",
+    "sum_observations",
     "summarize_tracks",
     "triangulate_tracks",
 ]
@@ -109,6 +113,22 @@ class MappedFrames:
     def readout(self) -> float:
         """Of a rolling shutter, as `Adjustment` has it."""
         return 0.0 if self.state is None else self.state.readout
+
+
+class PointSums(NamedTuple):
+    """Sums over the observations of each point.
+
+    Attributes:
+        count: (P, 1) how many there are.
+        direction: (P, 3), of unit directions from the point to the cameras.
+        log_size: (P, 1), of log2 of the keypoint's diameter as an angle times its distance.
+        descriptors: (P, D).
+    """
+
+    count: np.ndarray
+    direction: np.ndarray
+    log_size: np.ndarray
+    descriptors: np.ndarray
 
 
 def build_point_map(frames: MapFrames, adjust: bool = False) -> PointMap:
@@ -235,19 +255,13 @@ def _refine_in_parts(tracks: Tracks, columns: tuple[np.ndarray, ...]) -> np.ndar
 def summarize_tracks(mapped: MappedFrames) -> PointMap:
     """What a map keeps of its frames and tracks."""
     given, frames, tracks, camera = mapped.given, mapped.seen, mapped.tracks, mapped.camera
-    n = len(tracks.points)
-    count = np.bincount(tracks.track, minlength=n)[:, None]
-    to_camera = frames.position[tracks.frame] - tracks.points[tracks.track]
-    distance = np.linalg.norm(to_camera, axis=1)
-    direction = sum_by_track(tracks.track, to_camera / distance[:, None], n)
-    size = frames.size_px[tracks.frame, tracks.keypoint] / frames.focal_px[tracks.frame] * distance
-    descriptors = sum_by_track(tracks.track, frames.descriptors[tracks.frame, tracks.keypoint].astype(float), n)
+    sums = sum_observations(frames, tracks, len(tracks.points))
     order = np.lexsort((tracks.track, tracks.frame))
     return PointMap(
         points=tracks.points,
-        descriptors=quantize_descriptors(descriptors),
-        log_size=(sum_by_track(tracks.track, np.log2(size)[:, None], n) / count)[:, 0].astype(np.float32),
-        direction=(direction / np.linalg.norm(direction, axis=1, keepdims=True)).astype(np.float32),
+        descriptors=quantize_descriptors(sums.descriptors),
+        log_size=(sums.log_size / sums.count)[:, 0].astype(np.float32),
+        direction=(sums.direction / np.linalg.norm(sums.direction, axis=1, keepdims=True)).astype(np.float32),
         seen_point=tracks.track[order].astype(np.int32),
         seen_count=np.bincount(tracks.frame, minlength=len(frames)).astype(np.int32),
         rotation=frames.rotation,
@@ -255,6 +269,21 @@ def summarize_tracks(mapped: MappedFrames) -> PointMap:
         given_rotation=given.rotation,
         given_position=given.position,
         camera=np.array([camera.scale, *camera.centre, camera.k1, mapped.readout]),
+    )
+
+
+def sum_observations(frames: MapFrames, tracks: Tracks, n_points: int) -> PointSums:
+    """What the observations of each point add up to; `tracks.track` may leave points out."""
+    count = np.bincount(tracks.track, minlength=n_points)[:, None]
+    to_camera = frames.position[tracks.frame] - tracks.points[tracks.track]
+    distance = np.linalg.norm(to_camera, axis=1)
+    size = frames.size_px[tracks.frame, tracks.keypoint] / frames.focal_px[tracks.frame] * distance
+    descriptors = frames.descriptors[tracks.frame, tracks.keypoint].astype(float)
+    return PointSums(
+        count,
+        sum_by_track(tracks.track, to_camera / distance[:, None], n_points),
+        sum_by_track(tracks.track, np.log2(size)[:, None], n_points),
+        sum_by_track(tracks.track, descriptors, n_points),
     )
 
 

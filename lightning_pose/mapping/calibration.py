@@ -14,9 +14,11 @@ from lightning_pose.mapping.map_localizer import MapAnswer, MapLocalizer
 from lightning_pose.mapping.threads import map_in_threads
 
 __all__ = [
+    "MIN_ANSWERS",
     "UNKNOWN",
     "Calibration",
     "Measured",
+    "calibrate_answers",
     "calibrate_map",
     "find_conformal_factor",
     "locate_frames",
@@ -84,13 +86,18 @@ def calibrate_map(mapped: MappedFrames) -> Calibration:
     found = [each for each in map_in_threads(measure_block, blocks) if each is not None]
     if not found:
         return UNKNOWN
-    every = Measured(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+    return calibrate_answers(Measured(*(np.concatenate(parts) for parts in zip(*found, strict=True))))
+
+
+def calibrate_answers(found: Measured) -> Calibration:
+    """What answers for frames that the map does not have say about its errors."""
+    accepted = found.accepted
     return Calibration(
-        find_conformal_factor((every.position / every.position_sd)[every.accepted]),
-        find_conformal_factor((every.orientation_deg / every.orientation_sd_deg)[every.accepted]),
-        float(np.median(every.position)),
-        float(np.median(every.orientation_deg)),
-        float(every.accepted.mean()),
+        find_conformal_factor((found.position / found.position_sd)[accepted]),
+        find_conformal_factor((found.orientation_deg / found.orientation_sd_deg)[accepted]),
+        float(np.median(found.position)),
+        float(np.median(found.orientation_deg)),
+        float(accepted.mean()),
     )
 
 

@@ -10,7 +10,7 @@ import torch
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor, nn
 
-from lightning_pose.data.batches import PoseBatch
+from lightning_pose.data.batches import PoseBatch, PoseDataset
 from lightning_pose.data.datamodule import SceneDataModule, scene_datamodule
 from lightning_pose.geometry.absolute_pose import CameraPose
 from lightning_pose.geometry.camera import Camera
@@ -20,6 +20,7 @@ from lightning_pose.models.base import PoseModule
 from lightning_pose.models.parts.answers import Answers, answer_by_map, convert_answers, localize_prior
 from lightning_pose.models.parts.frame_cameras import list_cameras, scale_cameras
 from lightning_pose.models.parts.map_builder import BundleAdjust, MapBuilder, check_bundle_adjust, check_keypoints
+from lightning_pose.models.parts.map_extender import KnownMap, MapExtender, read_known_map
 from lightning_pose.models.parts.map_network import RESIZED, MapNetwork
 from lightning_pose.models.parts.memory import TrainingMemory
 from lightning_pose.models.parts.poses import Located
@@ -40,6 +41,9 @@ class LandmarkMap(TrainingMemory, PoseModule):
         bundle_adjust: `true` moves the training poses until they agree with the images, and carries answers back to
             the given poses; `auto` does so if validation frames (without them, training frames left out in turn) are
             located better; `false` takes the poses as they are.
+        extends: checkpoint of a `LandmarkMap` whose map gets the training frames of another recording of the scene, in
+            the same world, with the same features. Its points and frames stay where they are, and it is not adjusted
+            again: `bundle_adjust` is not used.
         refit: build the map again with the validation frames among the training frames. The validation metrics stay
             those of the map without.
         **kwargs: what `PoseModule` takes. `loss` is only logged; learning rate, decay and schedule are ignored.
@@ -57,6 +61,7 @@ class LandmarkMap(TrainingMemory, PoseModule):
     def __init__(
         self,
         bundle_adjust: BundleAdjust = "auto",
+        extends: str | None = None,
         refit: bool = True,
         standardize: bool = False,
         standardize_features: bool = False,
@@ -66,6 +71,8 @@ class LandmarkMap(TrainingMemory, PoseModule):
         self.automatic_optimization = False
         check_bundle_adjust(bundle_adjust)
         self.bundle_adjust: BundleAdjust = bundle_adjust
+        self.extends = extends
+        self._known: KnownMap | None = None
         self.refit = refit
         self.network = MapNetwork(self.input_shape[1] - 4)
         # Several processes can only train what has a parameter, although each of them builds the whole map.
@@ -85,6 +92,18 @@ class LandmarkMap(TrainingMemory, PoseModule):
         """Also refuse features that are no keypoints, or come without their places in the image."""
         super().check_data(datamodule)
         check_keypoints(datamodule.extractor)
+
+    def fit_world_frame(self, train: PoseDataset) -> None:
+        """That of the map that is extended, or as for others.
+
+        Raises:
+            CheckpointError, ConfigError: as `read_known_map`.
+        """
+        if self.extends is None:
+            super().fit_world_frame(train)
+            return
+        self._known = read_known_map(self.extends, scene_datamodule(self.trainer))
+        self.world_frame.set_extra_state(self._known.world_frame.get_extra_state())
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         # There is nothing to step along, but Lightning writes no checkpoint before some optimizer has stepped.
@@ -116,6 +135,8 @@ class LandmarkMap(TrainingMemory, PoseModule):
 
     def _make_builder(self) -> MapBuilder:
         datamodule = scene_datamodule(self.trainer)
+        if self._known is not None:
+            return MapExtender(self._known, self.network, datamodule, self.print)
         return MapBuilder(self.network, datamodule, self.world_frame, self.bundle_adjust, self.print)
 
     def decode_batch(self, batch: PoseBatch) -> tuple[Tensor, Tensor]:

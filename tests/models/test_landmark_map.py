@@ -187,3 +187,34 @@ def test_frames_of_which_nothing_can_be_triangulated_are_refused() -> None:
 def test_bundle_adjustment_that_is_not_understood_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"bundle_adjust is 'yes'; give true, false or auto"):
         LandmarkMap(input_shape=[50, 68], bundle_adjust="yes")  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def map_checkpoint(fitted: tuple[LandmarkMap, WallProblem], tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The checkpoint of the fitted map."""
+    path = tmp_path_factory.mktemp("map") / "best.ckpt"
+    model, _ = fitted
+    model.trainer.save_checkpoint(path)
+    return str(path)
+
+
+def test_a_map_is_extended_by_the_frames_of_another_recording(
+    fitted: tuple[LandmarkMap, WallProblem], map_checkpoint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    known, problem = fitted
+    model, _ = fit_wall(extends=map_checkpoint)
+    assert "map of 24 frames and 24 more" in capsys.readouterr().out
+    old, new = known.network.point_map, model.network.point_map
+    assert len(new.position) == 2 * len(old.position)
+    np.testing.assert_array_equal(new.points[: len(old)], old.points)
+    assert len(new) < 1.1 * len(old), "what is seen again is no new point"
+    data = problem.dataset("test").data
+    assert position_error_m(model(data.features).position_m, data.position_m).median() < 0.01
+    assert model.network.calibration.isfinite().all()
+
+
+def test_a_map_of_other_features_is_not_extended(map_checkpoint: str) -> None:
+    problem = WallProblem([WALL_KEYPOINTS, 36])
+    problem.extractor = SURF(WALL_KEYPOINTS - 1, with_geometry=True)
+    with pytest.raises(ConfigError, match=r"give data\.extractor the same"):
+        fit_wall(problem, extends=map_checkpoint)
