@@ -4,8 +4,8 @@
     torchrun --nproc_per_node 2 -m benchmarks.two_processes
 
 The first command keeps weights and losses in build/two_processes.pt; the second compares its own with them. Closed
-forms and maps should differ by 1e-6 at most. Networks step on other batches, so that they end elsewhere: the training
-loss of their last epoch says how close they come.
+forms and maps should differ by 1e-6 at most. Networks step on other batches, of as many frames together, so that they
+end elsewhere: the training loss of their last epoch says how close they come.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from lightning import Trainer
 from torch import Tensor
 
 from lightning_pose import models
+from lightning_pose.data.batches import make_loader
 from tests.models.helpers import ARCHITECTURES, make_model, problem_for
 
 FILE = Path("build/two_processes.pt")
@@ -41,12 +42,16 @@ def train(architecture: type[models.PoseModule], epochs: int) -> tuple[dict[str,
         enable_model_summary=False,
     )
     torch.manual_seed(trainer.global_rank)  # processes drop out other units
-    trainer.fit(model, datamodule=problem_for(model))
+    problem = problem_for(model)
+    frames = problem.train_dataloader().dataset
+    problem.train_dataloader = lambda: make_loader(frames, 8 // trainer.world_size, shuffle=True)
+    trainer.fit(model, datamodule=problem)
     loss = float(trainer.callback_metrics["train/loss"])
     weights = {name: tensor.detach().clone() for name, tensor in model.state_dict().items()}
     if trainer.world_size > 1:
-        for name, tensor in trainer.strategy.all_gather(weights).items():
-            if not torch.equal(tensor[0], tensor[1]):
+        for name, tensor in weights.items():
+            gathered = trainer.strategy.all_gather(tensor) if tensor.numel() else tensor[None]
+            if trainer.is_global_zero and not all(torch.equal(gathered[0], other) for other in gathered):
                 print(f"{architecture.__name__}: {name} differs between the processes")
     return weights, loss, trainer.world_size, trainer.is_global_zero
 
