@@ -50,7 +50,7 @@ def train(architecture: type[models.PoseModule], epochs: int) -> tuple[dict[str,
     weights = {name: tensor.detach().clone() for name, tensor in model.state_dict().items()}
     if trainer.world_size > 1:
         for name, tensor in weights.items():
-            gathered = trainer.strategy.all_gather(tensor) if tensor.numel() else tensor[None]
+            gathered = trainer.strategy.all_gather(tensor.double()) if tensor.numel() else tensor[None]
             if trainer.is_global_zero and not all(torch.equal(gathered[0], other) for other in gathered):
                 print(f"{architecture.__name__}: {name} differs between the processes")
     return weights, loss, trainer.world_size, trainer.is_global_zero
