@@ -74,7 +74,7 @@ def test_a_killed_worker_loses_no_image_and_repeats_only_what_it_had_under_way(
 
 
 def test_the_trial_of_a_killed_worker_is_run_again(
-    cluster: Cluster, workplace: Workplace, capfd: pytest.CaptureFixture[str]
+    long: None, cluster: Cluster, workplace: Workplace, capfd: pytest.CaptureFixture[str]
 ) -> None:
     killer = {"class_path": "tests.helpers.KillOnce", "init_args": {"marker": "killed", "epoch": 0}}
     settings = {"trainer.callbacks": [killer], "trainer.max_epochs": 1}
