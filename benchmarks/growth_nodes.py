@@ -23,10 +23,22 @@ from lightning import Trainer
 from torch.nn import functional as F
 
 from benchmarks.made_frames import EpochClock, MadeFrames, MadeVectors, fit_exponent, peak_rss_gb
+from lightning_pose.data.batches import PoseBatch
 from lightning_pose.models import NodePose
 from lightning_pose.models.parts.neighbour_graph import search_neighbours
 
 SETTINGS = {"neighbours": 30, "aggr": "mean", "standardize_features": False, "learning_rate": 0.0013, "slope": 1.0}
+
+
+class TimedNodePose(NodePose):
+    """Keeps the CPU seconds that the search of all neighbours takes."""
+
+    search_seconds = 0.0
+
+    def store_training(self, train: PoseBatch) -> None:
+        start = time.process_time()
+        super().store_training(train)
+        self.search_seconds = time.process_time() - start
 
 
 def measure(nodes: int, width: int, epochs: int, limit: int) -> dict[str, float]:
@@ -34,7 +46,7 @@ def measure(nodes: int, width: int, epochs: int, limit: int) -> dict[str, float]
     torch.manual_seed(0)
     with tempfile.TemporaryDirectory() as folder:
         data = MadeFrames(MadeVectors(width), nodes, 1024, Path(folder))
-        model = NodePose(input_shape=[width], full_graph_limit=limit, **SETTINGS)
+        model = TimedNodePose(input_shape=[width], full_graph_limit=limit, **SETTINGS)
         clock = EpochClock()
         trainer = Trainer(
             max_epochs=epochs, accelerator="cpu", callbacks=[clock], logger=False, enable_checkpointing=False,
@@ -44,20 +56,14 @@ def measure(nodes: int, width: int, epochs: int, limit: int) -> dict[str, float]
         trainer.fit(model, datamodule=data)
         total = time.process_time() - start
         error = float(trainer.callback_metrics["val/position_median_m"])
-        model.forget_features()
-        start = time.process_time()
-        model.store_training(model.localize_batch(data.dataset("train").data))
-        search = time.process_time() - start
         keys = F.normalize(model.memory_features, dim=-1)
         sample = torch.randperm(nodes)[:500]
         frame = model.memory_frame
         exact = search_neighbours(keys[sample], keys, 30, frame[sample], frame)
         found = model.memory_table[sample]
         recall = (found[:, :, None] == exact[:, None]).any(2).float().mean()
-    return {
-        "nodes": nodes, "search": search, "recall": float(recall), "epoch": clock.seconds[-1], "all": total,
-        "GiB": peak_rss_gb(), "error": error,
-    }  # fmt: skip
+    found = {"search": model.search_seconds, "recall": float(recall), "epoch": clock.seconds[-1], "all": total}
+    return found | {"GiB": peak_rss_gb(), "error": error}
 
 
 def main() -> None:
@@ -65,7 +71,7 @@ def main() -> None:
     parser.add_argument("--nodes", type=int, nargs="+", default=[1000, 10_000, 100_000, 1_000_000])
     parser.add_argument("--features", type=int, default=64)
     parser.add_argument("--epochs", type=int, default=2)
-    parser.add_argument("--full_graph_limit", type=int, default=10_000)
+    parser.add_argument("--full_graph_limit", type=int, default=2_000)
     parser.add_argument("--one", action="store_true", help="measure in this process, and print JSON")
     args = parser.parse_args()
     if args.one:

@@ -82,7 +82,8 @@ def _connect(scheduler: str, workers: int | None) -> Iterator[Client]:
     from distributed import Client, LocalCluster
 
     if scheduler == LOCAL:
-        cluster = LocalCluster(n_workers=workers or joblib.cpu_count(), threads_per_worker=1, dashboard_address="")
+        options: dict[str, Any] = {"threads_per_worker": 1, "dashboard_address": None}  # no web page
+        cluster = LocalCluster(n_workers=workers or joblib.cpu_count(), **options)
         with cluster, Client(cluster, set_as_default=False) as client:
             yield client
         return

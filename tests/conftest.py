@@ -27,6 +27,17 @@ def pytest_configure() -> None:
     shapes.turn_on_checks()
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--long", action="store_true", help="run tests too that take more than ten seconds")
+
+
+@pytest.fixture
+def long(pytestconfig: pytest.Config) -> None:
+    """Skips a test that takes long, unless `--long` is given."""
+    if not pytestconfig.getoption("--long"):
+        pytest.skip("takes long; --long runs it")
+
+
 @pytest.fixture(autouse=True, scope="session")
 def _hermetic(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:

@@ -40,6 +40,13 @@ def make(count: int = 30, **settings: Any) -> NodePose:
     return model.eval()
 
 
+def make_like(model: NodePose) -> NodePose:
+    """The same weights, in a model that computes the whole graph in every step."""
+    other = make()
+    other.load_state_dict(model.state_dict())
+    return other
+
+
 def decode(model: NodePose, features: Tensor) -> Tensor:
     return torch.cat(model.decode_features(features), dim=1)
 
@@ -133,6 +140,19 @@ def test_above_the_limit_training_is_of_the_model_that_is_evaluated(conv: str, a
         torch.testing.assert_close(torch.stack(drawn).mean(0), exact, atol=0.1, rtol=0)
     else:
         torch.testing.assert_close(trained, full, atol=1e-5, rtol=1e-5)
+
+
+def test_above_the_limit_neighbours_count_as_they_were_last_computed_and_anew_in_each_epoch() -> None:
+    first, other = (PoseBatch(*(tensor[rows] for tensor in frames(30))) for rows in (slice(0, 4), slice(20, 24)))
+    model = make(full_graph_limit=0).train()
+    model.decode_batch(first)
+    with torch.no_grad():
+        for parameter in model.network.convolutions[0].parameters():
+            parameter.mul_(2)
+    full = torch.cat(make_like(model).train().decode_batch(other), dim=1)
+    assert not torch.allclose(torch.cat(model.decode_batch(other), dim=1), full)
+    model.on_train_epoch_start()
+    torch.testing.assert_close(torch.cat(model.decode_batch(other), dim=1), full, atol=1e-5, rtol=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -277,6 +277,27 @@ def run_one(job: workers.Job) -> FrozenTrial:
     return last(study)
 
 
+def test_a_task_of_a_cluster_runs_the_trial_of_a_dead_worker_again(
+    job: workers.Job, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run_in_turn(function: Any, tasks: list[Any], *_: object) -> Iterator[tuple[int, Any]]:
+        """Stands for a cluster of one worker."""
+        yield from ((number, function(task)) for number, task in enumerate(tasks))
+
+    monkeypatch.setattr(trial, "TrialCLI", Fitted)
+    monkeypatch.setattr(workers, "run_tasks", run_in_turn)
+    shared, _ = job.open()
+    shared.enqueue_trial({"model.units": 7})
+    lost = shared.ask()
+    lost.suggest_int("model.units", 4, 40)
+    lost.set_user_attr("process", dead_process())
+    ended: list[int] = []
+    workers.run_on_cluster(job, 2, lambda: ended.append(1), 1, "tcp://127.0.0.1:8786")
+    assert states(shared) == ["FAIL", "COMPLETE", "COMPLETE"]
+    assert shared.trials[1].params == {"model.units": 7}
+    assert len(ended) == 2
+
+
 def test_a_study_whose_run_is_deleted_goes_on(
     job: workers.Job, workplace: Workplace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
