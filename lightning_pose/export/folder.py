@@ -17,7 +17,8 @@ from lightning_pose.errors import ConfigError
 from lightning_pose.export.agreement import Agreement, compare_answers, load_runner, locate_images
 from lightning_pose.export.frames import CheckFrames
 from lightning_pose.export.int8 import shrink_network
-from lightning_pose.export.map_files import describe_keypoints, write_map
+from lightning_pose.export.map_files import MAP_FILE, describe_keypoints, write_map
+from lightning_pose.export.runner.checksums import hash_part, sign_facts
 from lightning_pose.export.runner.system import FORMAT, FORMAT_VERSION
 from lightning_pose.export.runner_file import write_runner
 from lightning_pose.features import CNN, Pixels
@@ -29,7 +30,7 @@ from lightning_pose.models.parts.checkpoint_hooks import LEARNT_FRAMES
 
 __all__ = ["Exported", "export_system"]
 
-NETWORK_FILE = "model.onnx"
+NETWORK_FILE, RUNNER_FILE = "model.onnx", "localizer.py"
 
 REQUIREMENTS = """numpy>=2.1
 opencv-python-headless>=5.0  # 5.0: the release tried; opencv-python and the contrib versions do as well
@@ -95,7 +96,7 @@ def export_system(
         folder = Path(parent) / out.name
         folder.mkdir()
         facts = describe_system(system, checkpoint) | write_parts(system, folder)
-        (folder / "localizer.py").write_text(write_runner(), encoding="utf-8")
+        (folder / RUNNER_FILE).write_text(write_runner(), encoding="utf-8")
         network = "onnxruntime>=1.18\n" if facts["network"] else ""
         (folder / "requirements.txt").write_text(REQUIREMENTS + network, encoding="utf-8")
         write_facts(folder, facts)
@@ -186,7 +187,9 @@ def write_parts(system: TrainedSystem, folder: Path) -> dict[str, Any]:
 
 
 def write_facts(folder: Path, facts: Mapping[str, Any]) -> None:
-    """Write `localizer.json`."""
+    """Write `localizer.json`, with the checksums of the files that are there."""
+    parts = [RUNNER_FILE, *(name for name in (NETWORK_FILE, MAP_FILE) if (folder / name).is_file())]
+    facts = sign_facts({**facts, "files": {name: hash_part(folder / name) for name in parts}})
     (folder / "localizer.json").write_text(json.dumps(facts, indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
