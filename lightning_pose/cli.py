@@ -284,18 +284,16 @@ def _architecture_of(config: str) -> str | None:
 
 
 def main(argv: list[str]) -> int:
-    """Run one of LightningCLI's verbs; `argv` begins with it.
+    """Run one of LightningCLI's verbs, `argv` begins with it; return the exit code.
 
-    Returns:
-        The exit code: 0 done, 143 asked to end.
+    Raises:
+        KeyboardInterrupt: a signal has ended it.
     """
     try:
         PoseCLI(argv)
-    except SIGTERMException:
-        return 143
     except SystemExit as stop:
-        # Lightning turns Ctrl-C into exit code 1, once it has closed the run.
-        if stop.code == 1:
+        # Lightning turns Ctrl-C into exit code 1, once it has closed the run; its own for SIGTERM has none.
+        if stop.code == 1 or isinstance(stop, SIGTERMException):
             raise KeyboardInterrupt("`fit --ckpt_path last`, with the same settings, goes on") from stop
         raise
     return 0

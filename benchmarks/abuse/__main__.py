@@ -16,6 +16,10 @@ from benchmarks.abuse.table import Row
 from benchmarks.abuse.workplace import Workplace, make_workplace
 
 KINDS = {
+    "signals": ("benchmarks.abuse.signals", "send_signals", "SIGINT, SIGTERM, SIGHUP and a closed terminal"),
+    "disks": ("benchmarks.abuse.faults", "break_disks", "full and broken disks, a read-only home, a locked store"),
+    "fits": ("benchmarks.abuse.kills", "kill_fits", "kill -9 of fit, which then goes on"),
+    "commands": ("benchmarks.abuse.kills", "kill_commands", "kill -9 of extract, export and reconstruct"),
     "damage": ("benchmarks.abuse.damage", "damage_files", "bytes flipped and files cut short"),
 }
 

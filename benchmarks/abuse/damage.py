@@ -150,7 +150,7 @@ def _plain_pose(pose: LocatedPose) -> Any:
 
 def _damage(target: Target, count: int) -> Row:
     """Damage one file in all ways, and restore it."""
-    whole, rng = target.file.read_bytes(), random.Random(0)
+    whole, rng = target.file.read_bytes(), random.Random(0)  # noqa: S311
     expected, size = target.ask(), len(whole)
     ends = [*range(min(target.header, size)), *range(max(target.header, size - target.tail), size)]
     places = [*ends, *(rng.randrange(size) for _ in range(count))]

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import io
+import itertools
 import logging
 import os
 import shutil
+import signal
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,9 +22,10 @@ from mlflow.entities import Run
 
 from lightning_pose.__main__ import main
 from lightning_pose.scenes.synthetic import render_room
+from tests import processes
 from tests.processes import ForkedProcess
 
-__all__ = ["SYSTEMS", "Ended", "Workplace", "make_workplace"]
+__all__ = ["SYSTEMS", "Ended", "Workplace", "make_workplace", "run_command"]
 
 SURF = {"class_path": "lightning_pose.features.SURF", "init_args": {"n_features": 50}}
 KEYPOINTS = {"class_path": "lightning_pose.features.SURF", "init_args": {"n_features": 200, "with_geometry": True}}
@@ -41,6 +45,12 @@ SYSTEMS: Mapping[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
     ),
 }
 """By name: the class, its settings, and those of its data."""
+
+SLOW_PACKAGES = ("alembic", "lightning_pose", "matplotlib", "mlflow", "scipy", "sklearn", "sqlalchemy", "torchmetrics")
+"""Packages that commands import late, and processes to be killed have at once."""
+
+
+_copies = itertools.count()
 
 
 @dataclass(frozen=True)
@@ -104,8 +114,12 @@ class Workplace:
         return Ended(code, errors.getvalue())
 
     def fork(self, *words: object) -> ForkedProcess:
-        """A command in a process of its own."""
-        return ForkedProcess(main, [str(word) for word in words], folder=self.folder, environment=self.environment)
+        """A command in a process of its own, forked off one that has all modules that this process has by now."""
+        late = [name for name in sys.modules if name.partition(".")[0] in SLOW_PACKAGES]
+        processes.PRELOADED[:] = sorted({*processes.PRELOADED, *late})
+        return ForkedProcess(
+            run_command, [str(word) for word in words], folder=self.folder, environment=self.environment
+        )
 
     def complete(self, *words: object) -> Ended:
         """A command in a process of its own, waited for."""
@@ -122,15 +136,24 @@ class Workplace:
     def checkpoint(self, run: Run, name: str = "last") -> Path:
         return self.folder / "mlruns" / "checkpoints" / run.info.run_id / f"{name}.ckpt"
 
-    def copy(self, folder: Path) -> Workplace:
-        """An empty workplace of the same room, with this one's features."""
-        shutil.rmtree(folder, ignore_errors=True)
+    def copy(self, features: bool = True) -> Workplace:
+        """An empty workplace of the same room, in place of the last one, with or without this one's features."""
+        for old in self.folder.glob("copy-*"):
+            shutil.rmtree(old, ignore_errors=True)
+        folder = self.folder / f"copy-{next(_copies)}"  # MLflow keeps a connection for each address
         (folder / "mlruns").mkdir(parents=True)
-        if (self.folder / "cache").is_dir():
+        if features and (self.folder / "cache").is_dir():
             shutil.copytree(self.folder / "cache", folder / "cache")
         shutil.copy(self.folder / "empty.db", folder / "mlruns" / "mlflow.db")
         shutil.copy(self.folder / "empty.db", folder / "empty.db")
         return Workplace(folder, self.room)
+
+
+def run_command(words: list[str]) -> int:
+    """A command as a shell starts it: no signal is ignored, as those of a background job may be."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
+    return main(words)
 
 
 def make_workplace(folder: Path) -> Workplace:

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import ctypes
 import hashlib
 import json
+import os
+import shutil
 import tempfile
+import time
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -31,6 +36,14 @@ from lightning_pose.models.parts.checkpoint_hooks import LEARNT_FRAMES
 __all__ = ["Exported", "export_system"]
 
 NETWORK_FILE, RUNNER_FILE = "model.onnx", "localizer.py"
+
+UNFINISHED = ".exporting"
+"""End of the name of a folder that is being written."""
+
+STALE_SECONDS = 3600
+"""The writer of an unfinished folder this old was killed."""
+
+AT_FDCWD, RENAME_EXCHANGE = -100, 2  # of Linux's renameat2
 
 REQUIREMENTS = """numpy>=2.1
 opencv-python-headless>=5.0  # 5.0: the release tried; opencv-python and the contrib versions do as well
@@ -92,7 +105,8 @@ def export_system(
     out = out.expanduser().absolute()
     check_target(out, overwrite)
     out.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as parent:
+    _delete_abandoned(out)
+    with tempfile.TemporaryDirectory(prefix=f".{out.name}.", suffix=UNFINISHED, dir=out.parent) as parent:
         folder = Path(parent) / out.name
         folder.mkdir()
         facts = describe_system(system, checkpoint) | write_parts(system, folder)
@@ -126,10 +140,29 @@ def check_target(out: Path, overwrite: bool) -> None:
 
 
 def move_folder(folder: Path, out: Path) -> None:
-    """Put a finished folder in its place; an older one makes room only then."""
+    """Put a finished folder in its place, in one step where the system can exchange it for an older one."""
     if out.exists():
+        if _exchange(folder, out):
+            return
         out.rename(folder.parent / f"{out.name}.old")
     folder.rename(out)
+
+
+def _exchange(a: Path, b: Path) -> bool:
+    """Exchange two folders, so that a process that is killed leaves one or the other; False if the system cannot."""
+    try:
+        rename = ctypes.CDLL(None).renameat2
+    except (AttributeError, OSError, TypeError):  # not Linux
+        return False
+    return rename(AT_FDCWD, os.fsencode(a), AT_FDCWD, os.fsencode(b), RENAME_EXCHANGE) == 0
+
+
+def _delete_abandoned(out: Path) -> None:
+    """Delete what earlier exports to the same place have left that were killed."""
+    for abandoned in out.parent.glob(f".{out.name}.*{UNFINISHED}"):
+        with suppress(OSError):  # another process may delete it first
+            if time.time() - abandoned.stat().st_mtime > STALE_SECONDS:
+                shutil.rmtree(abandoned)
 
 
 def describe_system(system: TrainedSystem, checkpoint: Mapping[str, Any]) -> dict[str, Any]:
