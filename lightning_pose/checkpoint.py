@@ -20,7 +20,7 @@ from typing import Any
 
 import torch
 
-from lightning_pose.errors import CheckpointError
+from lightning_pose.errors import CheckpointError, PoseError
 
 __all__ = [
     "RENAMED_CLASSES",
@@ -137,7 +137,9 @@ def build_object(spec: Mapping[str, Any], allow: str | Iterable[str] = (), packa
     cls = _import_class(path, (package,) if package else tuple(BASES))
     try:
         return cls(**spec["init_args"])
-    except (TypeError, ValueError, RuntimeError, AttributeError) as error:
+    except PoseError:
+        raise
+    except Exception as error:  # settings of any kind may be in the file, and each class fails on them in its own way
         raise CheckpointError(
             f"{path} does not take the saved settings ({error}); it was saved by another version, train it again"
         ) from error

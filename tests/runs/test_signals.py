@@ -1,4 +1,4 @@
-"""Signals that ask a command to end: exit codes, a second one, one that is ignored, and one while a store is written."""
+"""Signals that ask a command to end: exit codes, a second one, an ignored one, and one while a store is written."""
 
 from __future__ import annotations
 
@@ -14,19 +14,11 @@ from lightning_pose.runs.signals import STOPPING, delay_interrupts, interrupt_on
 from tests.helpers import FailAt, Workplace
 
 
-class SignalAt(FailAt):
-    """Receives a signal in the middle of the second epoch.
-
-    Args:
-        name: of the signal.
-    """
-
-    def __init__(self, name: str) -> None:
-        super().__init__(epoch=1)
-        self.name = name
+class HangUpAt(FailAt):
+    """Receives SIGHUP in the middle of an epoch, as when a terminal is closed."""
 
     def stop(self) -> None:
-        signal.raise_signal(getattr(signal, self.name))
+        signal.raise_signal(signal.SIGHUP)
 
 
 @pytest.fixture(autouse=True)
@@ -70,16 +62,20 @@ def test_an_ignored_signal_stays_ignored() -> None:
 
 def test_signals_wait_for_the_end_of_a_write() -> None:
     written = []
-    with interrupt_on(STOPPING) as received, pytest.raises(KeyboardInterrupt), delay_interrupts():
-        signal.raise_signal(signal.SIGTERM)
-        written.append(True)
+
+    def write() -> None:
+        with delay_interrupts():
+            signal.raise_signal(signal.SIGTERM)
+            written.append(True)
+
+    with interrupt_on(STOPPING) as received, pytest.raises(KeyboardInterrupt):
+        write()
     assert (written, received) == ([True], [signal.SIGTERM])
 
 
-@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
-def test_a_signal_closes_the_run(name: str, workplace: Workplace, capsys: pytest.CaptureFixture[str]) -> None:
-    stopper = ["--trainer.callbacks+", "tests.runs.test_signals.SignalAt", "--trainer.callbacks.name", name]
-    assert workplace.run("fit", "--trainer.max_epochs", "1000", *stopper) == 128 + getattr(signal, name)
+def test_a_closed_terminal_closes_the_run(workplace: Workplace, capsys: pytest.CaptureFixture[str]) -> None:
+    stopper = ["--trainer.callbacks+", "tests.runs.test_signals.HangUpAt", "--trainer.callbacks.epoch", "1"]
+    assert workplace.run("fit", "--trainer.max_epochs", "1000", *stopper) == 128 + signal.SIGHUP
     (run,) = workplace.runs()
     assert run.info.status == "KILLED"
     assert workplace.checkpoint(run, "last").is_file()

@@ -9,7 +9,6 @@ from lightning_pose.errors import ConfigError
 from lightning_pose.models.parts import divergence
 from lightning_pose.models.parts.divergence import DivergenceWatch
 
-
 FRAMES = torch.tensor([4])
 
 
