@@ -49,6 +49,10 @@ COUNTS = ("accumulate_grad_batches", "check_val_every_n_epoch", "log_every_n_ste
 """Settings of the trainer that are 1 or more; Lightning divides by them without a check."""
 
 
+SECTIONS = ("trainer", "best", "report")
+"""Parts of a config whose settings have defaults; a line `trainer:` with nothing below means none."""
+
+
 class PoseCLI(LightningCLI):
     """`python -m lightning_pose fit | validate | test | predict`.
 
@@ -106,10 +110,13 @@ class PoseCLI(LightningCLI):
             self.config = parser.parse_args([rename_value(word) for word in args])
         except UnicodeDecodeError as error:
             raise ConfigError(f"the config is not text ({error}); give a YAML file") from error
+        config = self.config[self.config.subcommand] if "subcommand" in self.config else self.config
+        for name in SECTIONS:
+            if name in config and config[name] is None:
+                raise ConfigError(f"{name} has no settings; give some, or leave its line out of the config")
         if "subcommand" in self.config:
             # Lightning would read a checkpoint named here, and add its hyperparameters to the config.
             # `_with_saved_config` has added them already, so the name is put aside until then.
-            config = self.config[self.config.subcommand]
             self._checkpoint, config.ckpt_path = config.ckpt_path, None
 
     def instantiate_classes(self) -> None:
