@@ -30,7 +30,7 @@ from lightning_pose.localization.located_pose import LocatedPose
 from lightning_pose.runs.checkpoint_files import CheckpointFiles
 from lightning_pose.scenes.images import read_rgb
 
-__all__ = ["damage_files"]
+__all__ = ["damage_exported", "damage_records"]
 
 STEP = 1000
 """A file is cut at every so many bytes."""
@@ -67,38 +67,45 @@ class Target:
     random: int = 1000
 
 
-def damage_files(base: Workplace, times: int | None) -> Iterator[Row]:
-    """Damage every kind of file; a row each.
+def damage_records(base: Workplace, times: int | None) -> Iterator[Row]:
+    """Damage a cache record and checkpoints; a row each.
 
     Args:
         base: a workplace.
         times: how many bytes of the body are flipped, 1000 by default.
     """
-    for target in _list_targets(base):
-        count = target.random if times is None else min(times, target.random)
-        yield _damage(target, count)
+    for target in _list_records(base):
+        yield _damage(target, target.random if times is None else times)
 
 
-def _list_targets(base: Workplace) -> Iterator[Target]:
+def damage_exported(base: Workplace, times: int | None) -> Iterator[Row]:
+    """Damage every file of an exported folder that is read; a row each.
+
+    Args:
+        base: a workplace.
+        times: how many bytes of the body are flipped, 1000 by default, and 300 of `localizer.py`.
+    """
+    assert base.run("fit", "--config", base.config("refined")).code == 0
+    folder = base.folder / "exported"
+    assert base.run("export", base.checkpoint(base.runs()[0], "best"), "--out", folder).code == 0
+    for target in _list_exported(folder, min(base.room.glob("seq-*/*.png"))):
+        yield _damage(target, target.random if times is None else min(times, target.random))
+
+
+def _list_records(base: Workplace) -> Iterator[Target]:
     images = sorted(base.room.glob("seq-*/*.png"))
     cache = FeatureCache(SURF(50), base.folder / "records")
     cache.fill(images[:1], 1, progress=False)
     (record,) = cache.root.rglob("??/*.safetensors")
-    yield Target("cache record", record, lambda: cache.features(images[:1], 1, False).tobytes(), _safetensors(record))
-    for system in ("SurfLSTM", "LandmarkMap", "refined"):
+    yield Target(
+        "cache record", record, lambda: cache.features(images[:1], 1, False).tobytes(), _read_header_size(record)
+    )
+    for system, name in (("SurfLSTM", "last"), ("LandmarkMap", "best")):
         assert base.run("fit", "--config", base.config(system)).code == 0
-        run = base.runs()[0]
-        if system == "SurfLSTM":
-            yield _checkpoint_target("last.ckpt of a network", base.checkpoint(run), images[0])
-        elif system == "LandmarkMap":
-            yield _checkpoint_target("best.ckpt of a map", base.checkpoint(run, "best"), images[0])
-        else:
-            folder = base.folder / "exported"
-            assert base.run("export", base.checkpoint(run, "best"), "--out", folder).code == 0
-            yield from _exported_targets(folder, images[0])
+        yield _make_checkpoint_target(f"{name}.ckpt of {system}", base.checkpoint(base.runs()[0], name), images[0])
 
 
-def _checkpoint_target(name: str, file: Path, image: Path) -> Target:
+def _make_checkpoint_target(name: str, file: Path, image: Path) -> Target:
     def ask() -> Any:
         checkpoint = read_checkpoint(file)
         CheckpointFiles().load_checkpoint(file, weights_only=True)
@@ -109,7 +116,7 @@ def _checkpoint_target(name: str, file: Path, image: Path) -> Target:
         return Target(name, file, ask, HEADER, file.stat().st_size - archive.start_dir)
 
 
-def _exported_targets(folder: Path, image: Path) -> Iterator[Target]:
+def _list_exported(folder: Path, image: Path) -> Iterator[Target]:
     mirrored = np.ascontiguousarray(read_rgb(image)[:, ::-1])  # the map refuses it, so that the network answers
 
     def ask() -> Any:
@@ -124,12 +131,14 @@ def _exported_targets(folder: Path, image: Path) -> Iterator[Target]:
 
     facts = folder / "localizer.json"
     yield Target("exported localizer.json", facts, ask, facts.stat().st_size, random=0)
-    yield Target("exported map.safetensors", folder / "map.safetensors", ask, _safetensors(folder / "map.safetensors"))
+    yield Target(
+        "exported map.safetensors", folder / "map.safetensors", ask, _read_header_size(folder / "map.safetensors")
+    )
     yield Target("exported model.onnx", folder / "model.onnx", ask, HEADER)
     yield Target("exported localizer.py", folder / "localizer.py", ask_runner, 0, random=300)
 
 
-def _safetensors(file: Path) -> int:
+def _read_header_size(file: Path) -> int:
     """The length of a safetensors file's header."""
     return 8 + struct.unpack("<Q", file.read_bytes()[:8])[0]
 
