@@ -20,6 +20,7 @@ KINDS = {
     "disks": ("benchmarks.abuse.faults", "break_disks", "full and broken disks, a read-only home, a locked store"),
     "fits": ("benchmarks.abuse.kills", "kill_fits", "kill -9 of fit, which then goes on"),
     "commands": ("benchmarks.abuse.kills", "kill_commands", "kill -9 of extract, export and reconstruct"),
+    "threads": ("benchmarks.abuse.threads", "compare_threads", "the same fit with one and with two threads"),
     "records": ("benchmarks.abuse.damage", "damage_records", "bytes flipped in a cache record and in checkpoints"),
     "exported": ("benchmarks.abuse.damage", "damage_exported", "bytes flipped in the files of an exported folder"),
 }
