@@ -123,7 +123,8 @@ def _list_exported(folder: Path, image: Path) -> Iterator[Target]:
         return [_plain_pose(pose) for pose in Localizer.load(folder).localize([image, mirrored])]
 
     def ask_runner() -> Any:
-        with load_runner(folder) as module, contextlib.redirect_stdout(io.StringIO()) as out:
+        hidden = contextlib.redirect_stderr(io.StringIO())
+        with load_runner(folder) as module, contextlib.redirect_stdout(io.StringIO()) as out, hidden:
             code = module.main(folder, [str(image)])
             if code == 2:
                 raise PoseError
