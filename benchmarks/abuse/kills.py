@@ -93,8 +93,10 @@ def _kill_fit(base: Workplace, words: Sequence[object], seconds: float, expected
         ended = True
     elif resumed.code != 0:
         return f"cannot go on: {resumed.stderr.strip().splitlines()[-1][:100]}"
-    if read_result(place) != expected:
-        return "differs from the uninterrupted run"
+    result = read_result(place)
+    if result != expected:
+        names = sorted(name for name in result.keys() | expected.keys() if result.get(name) != expected.get(name))
+        return f"differs from the uninterrupted run in {', '.join(names[:3])} ({len(names)})"
     if any(run.info.status == "RUNNING" for run in runs):
         return "run left RUNNING"
     if len(runs) > 1 + anew:
@@ -115,10 +117,12 @@ def kill_commands(base: Workplace, times: int | None) -> Iterator[Row]:
     config = base.config("refined")
     assert base.run("fit", "--config", config).code == 0
     best = base.checkpoint(base.runs()[0], "best")
-    records = _read_records(base.folder / "cache")
+    records: dict[str, bytes] = {}  # of the command that is not killed
 
     def check_cache(place: Workplace) -> bool:
-        return _read_records(place.folder / "cache") == records
+        found = _read_records(place.folder / "cache")
+        records.update({} if records else found)
+        return found == records
 
     def check_folder(place: Workplace) -> bool:
         return place.complete("localize", "exported", base.room / "seq-01" / "frame-000000.color.png").code in (0, 1)
@@ -153,6 +157,7 @@ def _kill_command(
     with place.fork(*words) as process:
         seconds = _watch(process, float("inf"))
         assert process.wait() == 0
+    assert check(place)
     rng, found = random.Random(0), Counter[str]()  # noqa: S311
     for _ in range(count):
         place = base.copy(features=words[0] != "extract")

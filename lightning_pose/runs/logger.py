@@ -7,7 +7,7 @@ import logging
 import os
 import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -117,9 +117,10 @@ class MLflowLogger(MLFlowLogger):
             ConfigError: the store is gone before there is a run.
         """
         if not self._opened:
-            with _keep_environment():
+            # The run that it creates has to be closed; a server may take minutes not to answer.
+            with _keep_environment(), delay_interrupts() if sqlite_file(self.uri) else nullcontext():
                 self._open_run()
-            self._opened = True
+                self._opened = True
         return self._writer
 
     def _open_run(self) -> None:

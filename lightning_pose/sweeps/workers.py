@@ -234,10 +234,11 @@ def _run_worker(job: Job, left: Semaphore, ended: Semaphore) -> None:
 def _interrupt_workers(running: list[BaseProcess]) -> None:
     """End the workers as Ctrl-C does; those that received the Ctrl-C themselves ignore a second one."""
     end = time.monotonic() + PATIENCE_SECONDS
-    for process in running:
+    started = [process for process in running if process.pid is not None]  # Ctrl-C may come before the last one starts
+    for process in started:
         with suppress(ProcessLookupError):
             os.kill(process.pid or 0, signal.SIGINT)
-    for process in running:
+    for process in started:
         process.join(max(0, end - time.monotonic()))
         if process.is_alive():
             process.kill()
