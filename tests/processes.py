@@ -68,11 +68,6 @@ class ForkedProcess:
         """The exit code, minus the signal's number where one ended it; None while it runs."""
         return self._process.exitcode
 
-    @property
-    def pid(self) -> int:
-        """The number of the process."""
-        return self._process.pid or 0
-
     def poll(self) -> int | None:
         return self.returncode
 
