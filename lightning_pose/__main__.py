@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import difflib
 import errno
+import os
+import signal
 import sys
 from importlib import import_module
 
 from lightning_pose.errors import PoseError
+from lightning_pose.runs.signals import STOPPING, interrupt_on
 
 __all__ = ["main"]
 
@@ -62,7 +65,8 @@ def main(argv: list[str] | None = None) -> int:
     """Run one verb.
 
     Returns:
-        The exit code: 0 done, 2 the user's mistake, 130 interrupted. An internal error keeps its traceback.
+        The exit code: 0 done, 2 the user's mistake, 130 interrupted by Ctrl-C, 143 by SIGTERM, 129 by SIGHUP. An
+        internal error keeps its traceback.
     """
     argv = sys.argv[1:] if argv is None else argv
     if not argv or argv[0] in ("-h", "--help"):
@@ -74,6 +78,16 @@ def main(argv: list[str] | None = None) -> int:
         hint = f"did you mean {near[0]}?" if near else f"choose one of {', '.join(VERBS)}"
         print(f"error: there is no verb {verb!r}; {hint}", file=sys.stderr)
         return 2
+    with interrupt_on(STOPPING) as received:
+        try:
+            return _run_verb(verb, argv)
+        except KeyboardInterrupt as stop:
+            _say_last("; ".join(["interrupted", *map(str, stop.args)]))
+            return 128 + (received[0] if received else signal.SIGINT)
+
+
+def _run_verb(verb: str, argv: list[str]) -> int:
+    """The exit code of a verb; mistakes of the user and refusals are printed."""
     try:
         return import_module(VERBS[verb][0]).main(argv if verb in LIGHTNING_VERBS else argv[1:])
     except PoseError as error:
@@ -94,9 +108,17 @@ def main(argv: list[str] | None = None) -> int:
             raise
         print(f"error: {refusal}; `{PROGRAM} {verb} --help` explains every setting", file=sys.stderr)
         return 2
-    except KeyboardInterrupt as stop:
-        print("; ".join(["interrupted", *map(str, stop.args)]), file=sys.stderr)
-        return 130
+
+
+def _say_last(line: str) -> None:
+    """Print the last line of a command; a terminal that was closed takes none, nor what is still to be written."""
+    try:
+        print(line, file=sys.stderr, flush=True)
+        sys.stdout.flush()
+    except OSError:
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        for stream in (sys.stdout, sys.stderr):
+            os.dup2(nowhere, stream.fileno())
 
 
 def _find_refusal(error: Exception) -> str | None:

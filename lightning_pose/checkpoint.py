@@ -20,7 +20,8 @@ from typing import Any
 
 import torch
 
-from lightning_pose.errors import CheckpointError
+from lightning_pose.errors import CheckpointError, PoseError
+from lightning_pose.setting_types import find_mistyped
 
 __all__ = [
     "RENAMED_CLASSES",
@@ -135,9 +136,17 @@ def build_object(spec: Mapping[str, Any], allow: str | Iterable[str] = (), packa
     spec = _check_spec(spec, _list_allowed(allow))
     path = spec["class_path"]
     cls = _import_class(path, (package,) if package else tuple(BASES))
+    mistyped = find_mistyped(cls, spec["init_args"])
+    if mistyped is not None:
+        value = str(spec["init_args"][mistyped])[:80]
+        raise CheckpointError(
+            f"the checkpoint has {mistyped} = {value} for {path}, which is of another type; train again"
+        )
     try:
         return cls(**spec["init_args"])
-    except (TypeError, ValueError, RuntimeError, AttributeError) as error:
+    except PoseError:
+        raise
+    except Exception as error:  # settings of any kind may be in the file, and each class fails on them in its own way
         raise CheckpointError(
             f"{path} does not take the saved settings ({error}); it was saved by another version, train it again"
         ) from error

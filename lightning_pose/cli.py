@@ -49,6 +49,10 @@ COUNTS = ("accumulate_grad_batches", "check_val_every_n_epoch", "log_every_n_ste
 """Settings of the trainer that are 1 or more; Lightning divides by them without a check."""
 
 
+SECTIONS = ("trainer", "best", "report")
+"""Parts of a config whose settings have defaults; a line `trainer:` with nothing below means none."""
+
+
 class PoseCLI(LightningCLI):
     """`python -m lightning_pose fit | validate | test | predict`.
 
@@ -106,10 +110,13 @@ class PoseCLI(LightningCLI):
             self.config = parser.parse_args([rename_value(word) for word in args])
         except UnicodeDecodeError as error:
             raise ConfigError(f"the config is not text ({error}); give a YAML file") from error
+        config = self.config[self.config.subcommand] if "subcommand" in self.config else self.config
+        for name in SECTIONS:
+            if name in config and config[name] is None:
+                raise ConfigError(f"{name} has no settings; give some, or leave its line out of the config")
         if "subcommand" in self.config:
             # Lightning would read a checkpoint named here, and add its hyperparameters to the config.
             # `_with_saved_config` has added them already, so the name is put aside until then.
-            config = self.config[self.config.subcommand]
             self._checkpoint, config.ckpt_path = config.ckpt_path, None
 
     def instantiate_classes(self) -> None:
@@ -284,18 +291,16 @@ def _architecture_of(config: str) -> str | None:
 
 
 def main(argv: list[str]) -> int:
-    """Run one of LightningCLI's verbs; `argv` begins with it.
+    """Run one of LightningCLI's verbs, `argv` begins with it; return the exit code.
 
-    Returns:
-        The exit code: 0 done, 143 asked to end.
+    Raises:
+        KeyboardInterrupt: a signal has ended it.
     """
     try:
         PoseCLI(argv)
-    except SIGTERMException:
-        return 143
     except SystemExit as stop:
-        # Lightning turns Ctrl-C into exit code 1, once it has closed the run.
-        if stop.code == 1:
+        # Lightning turns Ctrl-C into exit code 1, once it has closed the run; its own for SIGTERM has none.
+        if stop.code == 1 or isinstance(stop, SIGTERMException):
             raise KeyboardInterrupt("`fit --ckpt_path last`, with the same settings, goes on") from stop
         raise
     return 0

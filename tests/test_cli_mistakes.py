@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import yaml
 
 from tests.helpers import REPOSITORY, Trained, Workplace
 
@@ -237,3 +238,13 @@ def test_a_model_that_reads_other_features(complaint: Complaint, workplace: Work
 def test_a_class_that_is_no_architecture(complaint: Complaint, workplace: Workplace) -> None:
     line = complaint("fit", "--config", workplace.config, "--model", "lightning_pose.data.ImageDataModule")
     assert re.search("ImageDataModule.*PoseModule", line), line
+
+
+@pytest.mark.parametrize("name", ["trainer", "report"])
+def test_a_section_without_settings(name: str, complaint: Complaint, workplace: Workplace) -> None:
+    """Such as one whose lines are all commented out."""
+    config = yaml.safe_load(workplace.config.read_text()) | {name: None}
+    workplace.config.write_text(yaml.safe_dump(config))
+    assert complaint("fit", "--config", workplace.config) == (
+        f"{name} has no settings; give some, or leave its line out of the config"
+    )

@@ -11,11 +11,13 @@ import pytest
 import torch
 import yaml
 
+from lightning_pose.evaluation.baselines.visual_odometry import read_clip_poses, run_visual_odometry
 from lightning_pose.geometry.quaternions import orientation_error_deg, position_error_m
-from lightning_pose.geometry.relative import absolute_poses
+from lightning_pose.geometry.relative import absolute_poses, relative_poses
 from lightning_pose.localization.localizer import Localizer
 from lightning_pose.localization.located_pose import stack_poses
 from lightning_pose.localization.video import VideoTracker
+from lightning_pose.scenes.formats import load_scene
 from tests.helpers import Trained, Workplace, write_scene
 
 
@@ -53,6 +55,22 @@ def test_errors_by_length_are_curves(clip_run: Trained) -> None:
         assert curve[4] == pytest.approx(clip_run.run.data.metrics[f"{system}/position_median_m"], rel=1e-4)
     assert {"test/drift_percent_by_length", "test/ate_rmse_m", "test/rpe_rmse_deg"} <= clip_run.run.data.metrics.keys()
     assert "baseline/visual_odometry/ate_rmse_m" in clip_run.run.data.metrics
+
+
+def test_a_stride_has_its_odometry(clip_run: Trained) -> None:
+    """Clips begin at every frame, also at those between the frames that are chained."""
+    workplace = clip_run.workplace
+    options = ("--data.stride", "2", "--data.hop", "1", "--data.clip_length", "3")
+    assert workplace.command("test", "--ckpt_path", clip_run.best, *options) == 0
+    tested = next(run for run in workplace.runs() if run.data.tags["verb"] == "test")
+    scene = load_scene(workplace.scene)
+    frames = [scene.frames[i] for i in scene.splits["test"]]
+    clips = np.arange(len(frames) - 4)[:, None] + np.array([0, 2, 4])
+    motion = run_visual_odometry(frames, clips, progress=False)
+    truth = relative_poses(*read_clip_poses(frames, clips))
+    errors = position_error_m(motion.position_m, truth[0])[:, 1:].flatten()
+    found = tested.data.metrics["baseline/visual_odometry/position_mean_m"]
+    assert found == pytest.approx(float(errors.mean()), abs=1e-4)
 
 
 def test_standing_still_is_as_wrong_as_the_truth_moves(clip_run: Trained) -> None:

@@ -195,3 +195,21 @@ def test_no_damage_changes_an_answer(tmp_path: Path) -> None:
             assert found.keys() == weights.keys()
             assert all(np.array_equal(found[name], value, equal_nan=True) for name, value in weights.items())
     assert refused > 200
+
+
+def test_features_that_the_model_cannot_read(tmp_path: Path) -> None:
+    file = write_checkpoint(tmp_path, data__init_args__extractor__init_args__with_geometry=True)
+    with pytest.raises(
+        CheckpointError, match=r"features have the shape \(\d+, 68\), and its SurfLSTM reads \(\d+, 64\)"
+    ):
+        Localizer.load(file).localize(np.random.default_rng(0).integers(0, 255, (48, 64), np.uint8))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("units", "8"), ("units", True), ("bidirectional", {"init_args": True}), ("cell", "gnu"), ("input_shape", 5)],
+)
+def test_settings_of_another_type(name: str, value: object, tmp_path: Path) -> None:
+    file = write_checkpoint(tmp_path, **{f"model__init_args__{name}": value})
+    with pytest.raises(CheckpointError, match=rf"the checkpoint has {name} = .* for lightning_pose.models.SurfLSTM"):
+        Localizer.load(file)

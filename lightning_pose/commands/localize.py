@@ -50,7 +50,7 @@ EPILOG = """exit codes:
   0    every image was located and accepted
   1    some images were refused
   2    an input or an option is wrong; nothing was located
-  130  interrupted; what was located until then is written
+  130  interrupted (143 by SIGTERM, 129 by SIGHUP); what was located until then is written
 
 examples:
   python -m lightning_pose localize best.ckpt image.jpg

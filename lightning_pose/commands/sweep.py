@@ -87,6 +87,7 @@ def main(argv: list[str]) -> int:
     own, overrides = _split_arguments(argv)
     args = _build_sweep_parser().parse_args(own)
     # Imported here, so that `--help` does not wait for them.
+    from lightning_pose.runs.signals import delay_interrupts
     from lightning_pose.studies.figure_spec import parse_figure_spec
     from lightning_pose.sweeps.parent_run import close_parent, open_parent
     from lightning_pose.sweeps.plan import read_plan
@@ -105,20 +106,23 @@ def main(argv: list[str]) -> int:
     spec = parse_figure_spec(plan.figure, plan.measure, plan.space)  # checked before anything is trained
     name = args.study or f"{args.file.stem}-{plan.scene}"
     storage = open_storage(args.storage, plan.tracking[0])
-    with lock_study(storage, name):
-        study = open_study(plan, name, storage)
-        client, parent = open_parent(study, plan)
-        recover_trials(study, storage, client)
-        if is_grid(plan):
-            enqueue_grid(study, plan)
-    status = "KILLED"
+    status, opened = "KILLED", None
     try:
+        with lock_study(storage, name):
+            study = open_study(plan, name, storage)
+            with delay_interrupts():  # the run that it opens has to be closed
+                client, parent = open_parent(study, plan)
+                opened = client, parent, study
+            recover_trials(study, storage, client)
+            if is_grid(plan):
+                enqueue_grid(study, plan)
         total = args.n_trials if args.n_trials is not None else plan.n_trials
         if is_grid(plan):
             total = min(count_waiting(study), math.inf if total is None else total)
         total = N_TRIALS if total is None else int(total)
         _run_trials(study, plan, Job(plan, name, args.storage, parent), total, args)
         client, parent = open_parent(study, plan)  # another one, if the user has deleted it meanwhile
+        opened = client, parent, study
         _write_results(study, plan, spec, client, parent, args.out or Path("mlruns") / "sweeps" / name)
         status = "FINISHED"
     except KeyboardInterrupt as stop:
@@ -127,7 +131,8 @@ def main(argv: list[str]) -> int:
         status = "FAILED"
         raise
     finally:
-        close_parent(client, parent, study, status)
+        if opened is not None:
+            close_parent(*opened, status)
     print(f"run {parent} in {plan.tracking[0]}\nstudy {name} in {hide_password(args.storage)}")
     return 0
 

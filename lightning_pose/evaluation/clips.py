@@ -69,7 +69,8 @@ def evaluate_clips(
     name = type(module.eval()).__name__
     sequences = _chain_sequences(datamodule, module, odometry)
     lengths = sorted({n for n in (*LENGTHS, datamodule.clip_length) if n <= datamodule.longest_clip("test")})
-    found = {n: _evaluate_length(datamodule, module, sequences, n) for n in lengths}
+    motion = _read_odometry(datamodule, sequences) if odometry else None
+    found = {n: _evaluate_length(datamodule, module, motion, n) for n in lengths}
     baselines = {system: m for system, m in found[datamodule.clip_length].items() if system != name}
     tracking = _measure_tracking(sequences)
     curves = {
@@ -108,16 +109,39 @@ def _chain_sequences(datamodule: ClipDataModule, module: PoseModule, odometry: b
         truth = Pose(data.position_m[rows].double(), data.quat_wxyz[rows].double())
         systems, failed = {type(module).__name__: Pose(*chained)}, 0
         if odometry:
-            motion = run_visual_odometry(frames, torch.arange(len(frames))[None])
-            failed = motion.failed_steps
-            start = truth.position_m[0], truth.quat_wxyz[0]
-            systems["visual_odometry"] = Pose(*absolute_poses(motion.position_m[0], motion.quat_wxyz[0], *start))
+            systems["visual_odometry"], failed = _follow_frames(frames, truth)
         found.append(Sequence(rows, frames, truth, systems, failed))
     return found
 
 
+def _follow_frames(frames: list[Frame], truth: Pose) -> tuple[Pose, int]:
+    """Visual odometry over frames from the true pose of the first, and how many steps failed."""
+    motion = run_visual_odometry(frames, torch.arange(len(frames))[None])
+    start = truth.position_m[0], truth.quat_wxyz[0]
+    return Pose(*absolute_poses(motion.position_m[0], motion.quat_wxyz[0], *start)), motion.failed_steps
+
+
+def _read_odometry(datamodule: ClipDataModule, sequences: list[Sequence]) -> Pose:
+    """Visual odometry's poses (M, ...) of all M test frames, for clips: also those that a stride leaves out of chains.
+
+    Poses of frames that no clip has together are of different chains.
+    """
+    scene, data = datamodule.scene, datamodule.dataset("test").data
+    found = Pose(torch.zeros(len(data.frame), 3).double(), torch.zeros(len(data.frame), 4).double())
+    parts = [(sequence.rows, sequence.systems["visual_odometry"]) for sequence in sequences]
+    for run in map(torch.from_numpy, datamodule.dataset("test").runs):
+        for rows in (run[offset :: datamodule.stride] for offset in range(1, datamodule.stride)):
+            if len(rows) > 1:
+                frames = [scene.frames[i] for i in data.frame[rows].tolist()]
+                truth = Pose(data.position_m[rows].double(), data.quat_wxyz[rows].double())
+                parts.append((rows, _follow_frames(frames, truth)[0]))
+    for rows, pose in parts:
+        found.position_m[rows], found.quat_wxyz[rows] = pose
+    return found
+
+
 def _evaluate_length(
-    datamodule: ClipDataModule, module: PoseModule, sequences: list[Sequence], length: int
+    datamodule: ClipDataModule, module: PoseModule, odometry: Pose | None, length: int
 ) -> dict[str, dict[str, float]]:
     """Metrics of the model, first, and of every baseline on clips of one length, first frames left out."""
     own = length == datamodule.clip_length  # with its own hop, as the model's metrics are
@@ -131,8 +155,8 @@ def _evaluate_length(
         "no_motion": Pose(*predict_no_motion(count, length)),
         "constant_velocity": Pose(velocity[0].expand(count, -1, 3), velocity[1].expand(count, -1, 4)),
     }
-    if "visual_odometry" in sequences[0].systems:
-        answers["visual_odometry"] = _cut_odometry(sequences, clips)
+    if odometry is not None:
+        answers["visual_odometry"] = _cut_odometry(odometry, clips)
     return {system: _summarize_clips(answer, truth) for system, answer in answers.items()}
 
 
@@ -147,13 +171,9 @@ def _predict_clips(module: PoseModule, clips: ClipDataset) -> Pose:
     return Pose(*(torch.cat(parts).double().cpu() for parts in zip(*poses, strict=True)))
 
 
-def _cut_odometry(sequences: list[Sequence], clips: ClipDataset) -> Pose:
+def _cut_odometry(odometry: Pose, clips: ClipDataset) -> Pose:
     """Visual odometry's poses of all clips (W, T, ...); in world axes it gets each clip's true first orientation."""
-    rows = torch.cat([sequence.rows for sequence in sequences])
-    place = torch.full((int(rows.max()) + 1,), -1)
-    place[rows] = torch.arange(len(rows))
-    poses = (torch.cat(parts) for parts in zip(*(s.systems["visual_odometry"] for s in sequences), strict=True))
-    position_m, quat_wxyz = (part[place[clips.rows()]] for part in poses)
+    position_m, quat_wxyz = (part[clips.rows()] for part in odometry)
     moved, turned = relative_poses(position_m, quat_wxyz)
     if clips.relative_frame == "world":
         moved = quat_rotate(clips.data.quat_wxyz[clips.rows()[:, :1]].double(), moved)

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import ctypes
 import hashlib
 import json
+import os
+import shutil
 import tempfile
+import time
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,7 +22,8 @@ from lightning_pose.errors import ConfigError
 from lightning_pose.export.agreement import Agreement, compare_answers, load_runner, locate_images
 from lightning_pose.export.frames import CheckFrames
 from lightning_pose.export.int8 import shrink_network
-from lightning_pose.export.map_files import describe_keypoints, write_map
+from lightning_pose.export.map_files import MAP_FILE, describe_keypoints, write_map
+from lightning_pose.export.runner.checksums import hash_part, sign_facts
 from lightning_pose.export.runner.system import FORMAT, FORMAT_VERSION
 from lightning_pose.export.runner_file import write_runner
 from lightning_pose.features import CNN, Pixels
@@ -29,7 +35,15 @@ from lightning_pose.models.parts.checkpoint_hooks import LEARNT_FRAMES
 
 __all__ = ["Exported", "export_system"]
 
-NETWORK_FILE = "model.onnx"
+NETWORK_FILE, RUNNER_FILE = "model.onnx", "localizer.py"
+
+UNFINISHED = ".exporting"
+"""End of the name of a folder that is being written."""
+
+STALE_SECONDS = 3600
+"""The writer of an unfinished folder this old was killed."""
+
+AT_FDCWD, RENAME_EXCHANGE = -100, 2  # of Linux's renameat2
 
 REQUIREMENTS = """numpy>=2.1
 opencv-python-headless>=5.0  # 5.0: the release tried; opencv-python and the contrib versions do as well
@@ -91,11 +105,12 @@ def export_system(
     out = out.expanduser().absolute()
     check_target(out, overwrite)
     out.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as parent:
+    _delete_abandoned(out)
+    with tempfile.TemporaryDirectory(prefix=f".{out.name}.", suffix=UNFINISHED, dir=out.parent) as parent:
         folder = Path(parent) / out.name
         folder.mkdir()
         facts = describe_system(system, checkpoint) | write_parts(system, folder)
-        (folder / "localizer.py").write_text(write_runner(), encoding="utf-8")
+        (folder / RUNNER_FILE).write_text(write_runner(), encoding="utf-8")
         network = "onnxruntime>=1.18\n" if facts["network"] else ""
         (folder / "requirements.txt").write_text(REQUIREMENTS + network, encoding="utf-8")
         write_facts(folder, facts)
@@ -125,10 +140,29 @@ def check_target(out: Path, overwrite: bool) -> None:
 
 
 def move_folder(folder: Path, out: Path) -> None:
-    """Put a finished folder in its place; an older one makes room only then."""
+    """Put a finished folder in its place, in one step where the system can exchange it for an older one."""
     if out.exists():
+        if _exchange(folder, out):
+            return
         out.rename(folder.parent / f"{out.name}.old")
     folder.rename(out)
+
+
+def _exchange(a: Path, b: Path) -> bool:
+    """Exchange two folders, so that a process that is killed leaves one or the other; False if the system cannot."""
+    try:
+        rename = ctypes.CDLL(None).renameat2
+    except (AttributeError, OSError, TypeError):  # not Linux
+        return False
+    return rename(AT_FDCWD, os.fsencode(a), AT_FDCWD, os.fsencode(b), RENAME_EXCHANGE) == 0
+
+
+def _delete_abandoned(out: Path) -> None:
+    """Delete what earlier exports to the same place have left that were killed."""
+    for abandoned in out.parent.glob(f".{out.name}.*{UNFINISHED}"):
+        with suppress(OSError):  # another process may delete it first
+            if time.time() - abandoned.stat().st_mtime > STALE_SECONDS:
+                shutil.rmtree(abandoned)
 
 
 def describe_system(system: TrainedSystem, checkpoint: Mapping[str, Any]) -> dict[str, Any]:
@@ -186,7 +220,9 @@ def write_parts(system: TrainedSystem, folder: Path) -> dict[str, Any]:
 
 
 def write_facts(folder: Path, facts: Mapping[str, Any]) -> None:
-    """Write `localizer.json`."""
+    """Write `localizer.json`, with the checksums of the files that are there."""
+    parts = [RUNNER_FILE, *(name for name in (NETWORK_FILE, MAP_FILE) if (folder / name).is_file())]
+    facts = sign_facts({**facts, "files": {name: hash_part(folder / name) for name in parts}})
     (folder / "localizer.json").write_text(json.dumps(facts, indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 

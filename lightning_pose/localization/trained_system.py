@@ -14,7 +14,7 @@ import torch
 
 from lightning_pose.checkpoint import build_object, check_specs, read_checkpoint
 from lightning_pose.errors import CheckpointError
-from lightning_pose.features.base import FeatureExtractor
+from lightning_pose.features.base import FeatureExtractor, Record
 from lightning_pose.geometry.absolute_pose import CameraPose
 from lightning_pose.geometry.camera import Camera
 from lightning_pose.geometry.relative import RelativeFrame
@@ -122,7 +122,7 @@ class TrainedSystem:
             shared = for_map is array and refinement.extractor.shares_records(extractor)
             of_map = record if shared else refinement.extractor.extract([to_gray(for_map)])[0]
             keypoints = torch.from_numpy(refinement.extractor.features(of_map)[None])
-        features = torch.from_numpy(extractor.features(record)[None])
+        features = self._make_features(record)[None]
         extracted = time.perf_counter()
         size = for_map.shape[1], for_map.shape[0]
         with torch.inference_mode():
@@ -134,6 +134,20 @@ class TrainedSystem:
             return pose
         scale = np.array(image.size) / size
         return replace(pose, inliers_px=self._find_inliers(answers.shown[0], camera or view, size, scale))
+
+    def _make_features(self, record: Record) -> torch.Tensor:
+        """What the model reads of an image.
+
+        Raises:
+            CheckpointError: the model reads features of another shape.
+        """
+        features, wanted = self.extractor.features(record), tuple(self.model.input_shape)
+        if features.shape != wanted:
+            raise CheckpointError(
+                f"the checkpoint's {self.extractor.name} features have the shape {features.shape}, and its {self.name} "
+                f"reads {wanted}; it is damaged, train it again"
+            )
+        return torch.from_numpy(features)
 
     def _find_inliers(self, shown: ShownPoints, camera: Camera, size: tuple[int, int], scale: np.ndarray) -> np.ndarray:
         """(K, 2) float32 pixels of the keypoints of inliers, in the image before it was enlarged by 1 / `scale`."""
@@ -154,7 +168,7 @@ class TrainedSystem:
             return []
         started = time.perf_counter()
         records = self.extractor.extract([image.array for image in images])
-        features = torch.from_numpy(np.stack([self.extractor.features(record) for record in records]))
+        features = torch.stack([self._make_features(record) for record in records])
         extracted = time.perf_counter()
         position_m, quat_wxyz = locate_sequence(self.model, features, *self.clips)
         ended = time.perf_counter()
@@ -173,7 +187,7 @@ class TrainedSystem:
         def locate_next(image: LoadedImage) -> LocatedPose:
             started = time.perf_counter()
             record = self.extractor.extract([image.array])[0]
-            features = torch.from_numpy(self.extractor.features(record))
+            features = self._make_features(record)
             extracted = time.perf_counter()
             position_m, quat_wxyz = follower.add(features)
             ended = time.perf_counter()

@@ -196,6 +196,7 @@ class PoseModule(RefinedModule, StandardizedModule):
             self.fit_world_frame(train)
             position_m, quat_wxyz = self.training_poses(train)
             position = self.world_frame.to_local(position_m)
+            self.divergence.names = [f"{frame.sequence}/{frame.image.name}" for frame in datamodule.scene.frames]
             self.divergence.spread_m = float((position - position.mean(0)).norm(dim=-1).mean())
             self.fit_scale(position.to(self.pose_mean), quat_wxyz.to(self.quat_reference))
             self.fit_feature_scale(train.data.features)
@@ -237,7 +238,7 @@ class PoseModule(RefinedModule, StandardizedModule):
         terms, position, _ = self._compare(batch, by_item=False)
         named = {_name_loss("train", name): term for name, term in terms.items()}
         self.log_dict(named, on_step=False, on_epoch=True, batch_size=len(batch.frame), sync_dist=True)
-        self.divergence.add_step(terms["total"], position, batch.position_m)
+        self.divergence.add_step(terms["total"], position, batch.position_m, batch.frame, self._remedy)
         return terms["total"]
 
     def _judge_step(self, batch: PoseBatch, metrics: PoseMetrics, losses: ItemMeans) -> Pose:

@@ -140,6 +140,7 @@ class LastCheckpoint(_RunCheckpoint):
         self.finishes = False
         self._stopped = False
         self._settings: dict[str, object] = {}
+        self._logged: dict[str, Any] = {}
         self._random_states: list[RandomState] | None = None
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -147,21 +148,37 @@ class LastCheckpoint(_RunCheckpoint):
         # A run that ran out of time may go on with more of it.
         self._stopped = trainer.should_stop and not (timer is not None and (timer.time_remaining() or 1) <= 0)
         self._settings = {"seed_everything": read_seed(), "trainer.precision": str(trainer.precision)}
+        measured = {name: float(v) for name, v in trainer.callback_metrics.items() if name.startswith("train/")}
+        self._logged = {"step": trainer.global_step - 1, "metrics": measured}
         super().on_train_epoch_end(trainer, pl_module)
 
     def state_dict(self) -> dict[str, Any]:
         own = {"stopped": self._stopped, "settings": self._settings, "random_states": collect_random_states()}
-        return {**super().state_dict(), **own}
+        return {**super().state_dict(), **own, "logged": self._logged}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         super().load_state_dict(state_dict)
         self._stopped = state_dict.get("stopped", False)
         self._random_states = state_dict.get("random_states")
+        self._logged = state_dict.get("logged", {}) if self._is_same_run(state_dict) else {}
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         super().on_fit_start(trainer, pl_module)
+        self._log_missing(trainer)
         if self.finishes and self._stopped:
             trainer.should_stop = True
+
+    def _log_missing(self, trainer: Trainer) -> None:
+        """Log the training metrics of the checkpoint's epoch if the run lacks them.
+
+        Lightning logs them after the checkpoint is written; a process that is killed in between has not.
+        """
+        logger, metrics = run_logger(trainer), self._logged.get("metrics")
+        if logger is None or not metrics:
+            return
+        step, name = self._logged["step"], next(iter(metrics))
+        if all(metric.step != step for metric in logger.client.get_metric_history(str(logger.run_id), name)):
+            logger.log_metrics(metrics, step)
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if self._random_states is not None:

@@ -5,11 +5,9 @@ from __future__ import annotations
 import ast
 import logging
 import os
-import signal
-import threading
 import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -26,6 +24,7 @@ from lightning_pose.paths import STORE_VARIABLE, default_tracking_uri
 from lightning_pose.runs.client import BufferedClient, is_unreachable
 from lightning_pose.runs.process import has_owner_died, process_tags
 from lightning_pose.runs.reader import mask_passwords, read_pages
+from lightning_pose.runs.signals import delay_interrupts
 from lightning_pose.runs.store import prepare_store, sqlite_file
 from lightning_pose.runs.tags import PARENT_TAG
 from lightning_pose.scenes.images import read_rgb
@@ -118,9 +117,10 @@ class MLflowLogger(MLFlowLogger):
             ConfigError: the store is gone before there is a run.
         """
         if not self._opened:
-            with _keep_environment():
+            # The run that it creates has to be closed; a server may take minutes not to answer.
+            with _keep_environment(), delay_interrupts() if sqlite_file(self.uri) else nullcontext():
                 self._open_run()
-            self._opened = True
+                self._opened = True
         return self._writer
 
     def _open_run(self) -> None:
@@ -173,11 +173,11 @@ class MLflowLogger(MLFlowLogger):
 
     @rank_zero_only
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
-        """Log metrics; Ctrl-C takes effect once they are written."""
+        """Log metrics; Ctrl-C and other signals take effect once they are written."""
         if sqlite_file(self.uri) is None:
             super().log_metrics(metrics, step)
             return
-        with _delay_interrupts():
+        with delay_interrupts():
             super().log_metrics(metrics, step)
 
     @rank_zero_only
@@ -186,26 +186,6 @@ class MLflowLogger(MLFlowLogger):
         if self._opened:
             self.client.set_terminated(str(self.run_id), self.stopped_as if status == "failed" else "FINISHED")
             self.client.finish()
-
-
-@contextmanager
-def _delay_interrupts() -> Iterator[None]:
-    """Delay Ctrl-C until the end of the block.
-
-    A transaction that KeyboardInterrupt breaks off may keep SQLite locked for this process: the next write, which is
-    to close the run, waits 20 s and fails with "database is locked".
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield  # signals reach the main thread alone
-        return
-    pressed: list[int] = []
-    before = signal.signal(signal.SIGINT, lambda number, frame: pressed.append(number))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, signal.SIG_DFL if before is None else before)
-    if pressed:
-        signal.raise_signal(signal.SIGINT)
 
 
 @contextmanager

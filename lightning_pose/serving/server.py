@@ -21,8 +21,6 @@ HEADERS_S = 10.0
 STOP_S = 5
 """How long requests may take to end after a signal, beyond the time that a request may take."""
 
-SIGTERM_EXIT = 128 + signal.SIGTERM
-
 
 class TimedProtocol(H11Protocol):
     """Uvicorn's protocol, which ends connections where no request arrives: uvicorn itself waits for ever."""
@@ -105,18 +103,25 @@ def make_server(app: FastAPI, timeout_s: float, access_log: bool = False) -> uvi
 
 
 def run_server(server: uvicorn.Server, listener: socket.socket) -> None:
-    """Answer requests until SIGINT or SIGTERM; those that have begun are answered first.
+    """Answer requests until SIGINT, SIGTERM or SIGHUP; those that have begun are answered first.
 
     Raises:
         KeyboardInterrupt: after SIGINT.
-        SystemExit: with code 143, after SIGTERM.
+        SystemExit: with code 143, after SIGTERM, or 129, after SIGHUP.
     """
+    hung_up: list[int] = []
 
     def end(number: int, frame: FrameType | None) -> None:
-        raise SystemExit(SIGTERM_EXIT)
+        raise SystemExit(128 + number)
+
+    def hang_up(number: int, frame: FrameType | None) -> None:  # uvicorn leaves this signal alone
+        hung_up.append(number)
+        server.should_exit = True
 
     # Uvicorn raises the signal again once it has stopped. Shells let background jobs ignore SIGINT, which it overrides.
     handlers = {signal.SIGTERM: end, signal.SIGINT: signal.default_int_handler}
+    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # as under `nohup`
+        handlers[signal.SIGHUP] = hang_up
     before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
     try:
         server.run(sockets=[listener])
@@ -124,3 +129,5 @@ def run_server(server: uvicorn.Server, listener: socket.socket) -> None:
         for number, handler in before.items():
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
         listener.close()
+    if hung_up:
+        raise SystemExit(128 + hung_up[0])

@@ -26,6 +26,7 @@ from lightning_pose.features.keypoint_statistics import measure_keypoints
 from lightning_pose.models.parts.ridge import shared_factors
 from lightning_pose.runs.checkpoints import BestCheckpoint, checkpoint_folder, run_logger
 from lightning_pose.runs.process import process_tags
+from lightning_pose.runs.signals import delay_interrupts
 from lightning_pose.runs.tags import CURVES, METRICS, PARENT_TAG, REASON, RUN
 from lightning_pose.sweeps.base_config import ParsedConfig, open_keypoint_data
 from lightning_pose.sweeps.plan import Plan
@@ -230,7 +231,8 @@ class _TrialRecord:
         study, number = self.trial.study.study_name, self.trial.number
         tags = {PARENT_TAG: parent, "sweep.study": study, "sweep.trial": str(number), **process_tags()}
         name = f"{study} trial {number}"  # until its settings are known
-        self.run = self.client.create_run(experiment.experiment_id, run_name=name, tags=tags).info.run_id
+        with delay_interrupts():  # the run has to be closed
+            self.run = self.client.create_run(experiment.experiment_id, run_name=name, tags=tags).info.run_id
         self.trial.set_user_attr(RUN, self.run)
         with contextlib.suppress(MlflowException):  # if the user has deleted it, the trial runs all the same
             # A command that ended between two trials of this one has closed it.

@@ -22,7 +22,6 @@ from multiprocessing.connection import wait
 from multiprocessing.context import ForkServerContext, SpawnContext
 from multiprocessing.process import BaseProcess
 from multiprocessing.synchronize import Semaphore
-from types import FrameType
 
 import optuna
 from mlflow import MlflowClient
@@ -32,6 +31,7 @@ from optuna.storages import RDBStorage, fail_stale_trials
 from optuna.trial import TrialState
 
 from lightning_pose.runs.process import process_name
+from lightning_pose.runs.signals import STOPPING, interrupt_on
 from lightning_pose.runs.tags import PROCESS
 from lightning_pose.sweeps.plan import Plan
 from lightning_pose.sweeps.storage import lock_study
@@ -69,20 +69,6 @@ class Job:
         return load_study(self.plan, self.study, storage), storage
 
 
-def _raise_interrupt_once() -> None:
-    """Let Ctrl-C count once: a second one must not end the process while it queues the trial of the first again."""
-    received = False
-
-    def handle(number: int, frame: FrameType | None) -> None:
-        nonlocal received
-        if not received:
-            received = True
-            raise KeyboardInterrupt
-
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # else it is ignored, or the caller handles it
-        signal.signal(signal.SIGINT, handle)
-
-
 def run_here(job: Job, total: int, on_end: Callable[[], None]) -> None:
     """Run this many trials in this process; fewer where a grid has no more.
 
@@ -95,16 +81,12 @@ def run_here(job: Job, total: int, on_end: Callable[[], None]) -> None:
         KeyboardInterrupt: Ctrl-C; the trial under way is queued again.
     """
     study, storage = job.open()
-    before = signal.getsignal(signal.SIGINT)
-    _raise_interrupt_once()
-    try:
+    # A second Ctrl-C must not end the process while it queues the trial of the first again.
+    with interrupt_on([signal.SIGINT]):
         for _ in range(total):
             if not run_next_trial(study, storage, job):
                 return
             on_end()
-    finally:
-        if before is signal.default_int_handler:
-            signal.signal(signal.SIGINT, before)
 
 
 def run_next_trial(study: Study, storage: RDBStorage, job: Job) -> bool:
@@ -237,14 +219,14 @@ def _run_task(job: Job) -> bool:
 
 def _run_worker(job: Job, left: Semaphore, ended: Semaphore) -> None:
     """Run trials in a worker process while `left` counts any and the command is there; release `ended` after each."""
-    _raise_interrupt_once()
     parent = multiprocessing.parent_process()
     try:
-        study, storage = job.open()
-        while parent is not None and parent.is_alive() and left.acquire(block=False):
-            if not run_next_trial(study, storage, job):
-                return  # other commands have taken the rest of the grid
-            ended.release()
+        with interrupt_on([signal.SIGINT, *STOPPING]):
+            study, storage = job.open()
+            while parent is not None and parent.is_alive() and left.acquire(block=False):
+                if not run_next_trial(study, storage, job):
+                    return  # other commands have taken the rest of the grid
+                ended.release()
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
 
@@ -252,10 +234,11 @@ def _run_worker(job: Job, left: Semaphore, ended: Semaphore) -> None:
 def _interrupt_workers(running: list[BaseProcess]) -> None:
     """End the workers as Ctrl-C does; those that received the Ctrl-C themselves ignore a second one."""
     end = time.monotonic() + PATIENCE_SECONDS
-    for process in running:
+    started = [process for process in running if process.pid is not None]  # Ctrl-C may come before the last one starts
+    for process in started:
         with suppress(ProcessLookupError):
             os.kill(process.pid or 0, signal.SIGINT)
-    for process in running:
+    for process in started:
         process.join(max(0, end - time.monotonic()))
         if process.is_alive():
             process.kill()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
 import subprocess
@@ -21,7 +22,9 @@ from lightning_pose.data import ImageDataModule
 from lightning_pose.errors import CheckpointError, ConfigError
 from lightning_pose.export.agreement import Agreement, compare_answers
 from lightning_pose.export.frames import find_run_frames
+from lightning_pose.export.runner.checksums import sign_facts
 from lightning_pose.export.runner.system import FORMAT_VERSION, ExportedSystem
+from lightning_pose.export.runner.system import read_facts as read_signed_facts
 from lightning_pose.features import CNN
 from lightning_pose.localization.localizer import Localizer
 from lightning_pose.localization.located_pose import LocatedPose
@@ -228,14 +231,25 @@ def test_mistakes_are_one_line(mapped_room: MappedRoom, tmp_path: Path, capsys: 
 
 def change_facts(**changes: Any) -> Callable[[Path], None]:
     def change(folder: Path) -> None:
-        (folder / "localizer.json").write_text(json.dumps(read_facts(folder) | changes))
+        (folder / "localizer.json").write_text(json.dumps(sign_facts(read_facts(folder) | changes)))
 
     return change
 
 
-def cut_map(folder: Path) -> None:
-    file = folder / "map.safetensors"
-    file.write_bytes(file.read_bytes()[:-100])
+def flip_byte(name: str, place: int) -> Callable[[Path], None]:
+    def flip(folder: Path) -> None:
+        data = bytearray((folder / name).read_bytes())
+        data[place] ^= 1
+        (folder / name).write_bytes(data)
+
+    return flip
+
+
+def forget_checksum(folder: Path) -> None:
+    """As one damaged byte in its name would."""
+    facts = read_facts(folder)
+    del facts["sha256"]
+    (folder / "localizer.json").write_text(json.dumps(facts))
 
 
 @pytest.mark.parametrize(
@@ -251,7 +265,8 @@ def cut_map(folder: Path) -> None:
         (lambda folder: (folder / "localizer.json").write_text("{"), r"cannot be read as a localizer"),
         (lambda folder: (folder / "localizer.json").write_text("[]"), r"cannot be read as a localizer"),
         (lambda folder: (folder / "map.safetensors").unlink(), r"map.safetensors cannot be read"),
-        (cut_map, r"map.safetensors cannot be read"),
+        (flip_byte("map.safetensors", -9), r"map.safetensors is damaged \(its checksum differs\); copy it again"),
+        (forget_checksum, r"localizer.json is damaged"),
     ],
 )
 def test_a_folder_that_cannot_be_asked_says_why(copied: Path, change: Callable[[Path], None], message: str) -> None:
@@ -262,6 +277,27 @@ def test_a_folder_that_cannot_be_asked_says_why(copied: Path, change: Callable[[
     assert found.returncode == 2
     assert found.stderr.startswith("error: ")
     assert found.stderr.count("\n") == 1
+
+
+def test_damage_of_one_byte_changes_no_answer(copied: Path) -> None:
+    facts, data = read_facts(copied), (copied / "localizer.json").read_bytes()
+    for place in range(0, len(data), 7):
+        flip_byte("localizer.json", place)(copied)
+        with contextlib.suppress(CheckpointError):
+            assert read_signed_facts(copied) == facts, place
+        (copied / "localizer.json").write_bytes(data)
+    assert read_signed_facts(copied) == facts
+    flip_byte("localizer.py", 100)(copied)  # in its docstring
+    found = ask_alone(copied, "a.png")
+    assert (found.returncode, found.stdout) == (2, "")
+    assert "localizer.py is damaged" in found.stderr
+
+
+def test_a_folder_without_checksums_is_read(copied: Path) -> None:
+    """As earlier versions wrote it."""
+    facts = {name: value for name, value in read_facts(copied).items() if name not in ("files", "sha256")}
+    (copied / "localizer.json").write_text(json.dumps(facts))
+    assert ExportedSystem(copied).name == "LandmarkMap"
 
 
 def test_no_code_of_a_folder_is_run(copied: Path, mapped_room: MappedRoom, tmp_path: Path) -> None:

@@ -144,3 +144,22 @@ def test_more_epochs_are_recorded(workplace: Workplace) -> None:
     assert workplace.run("fit", "--ckpt_path", "last", "--trainer.max_epochs", "3") == 0
     (run,) = workplace.runs()
     assert run.data.tags["trainer.max_epochs"] == "3"
+
+
+class DieUnlogged(FailAt):
+    """Breaks between the epoch's checkpoint and Lightning's log of its training metrics."""
+
+    def on_train_batch_end(self, trainer: Trainer, *args: object, **kwargs: object) -> None:
+        if trainer.current_epoch == self.epoch:
+            logger = next(iter(trainer.loggers))
+            logger.log_metrics = lambda metrics, step=None: self.stop()  # type: ignore[method-assign]
+
+
+def test_the_metrics_of_the_checkpoint_s_epoch_are_logged(workplace: Workplace) -> None:
+    settings = ["--trainer.max_epochs", "3", "--data.val_fraction", "0"]
+    run = stop_run(workplace, *settings, *stop_at("tests.runs.test_resume.DieUnlogged", 1))
+    steps = {metric.step for metric in workplace.client.get_metric_history(run.info.run_id, "train/loss")}
+    assert workplace.run("fit", *settings, "--ckpt_path", "last") == 0
+    history = workplace.client.get_metric_history(run.info.run_id, "train/loss")
+    assert len(steps) == 1
+    assert [metric.step for metric in history] == [2, 5, 8]

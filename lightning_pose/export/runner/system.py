@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from lightning_pose.errors import CheckpointError
+from lightning_pose.export.runner.checksums import check_facts, check_part
 from lightning_pose.export.runner.clips import FrameFollower, chain_clips
 from lightning_pose.export.runner.keypoints import (
     Keypoints,
@@ -68,6 +69,7 @@ def read_facts(folder: Path) -> dict[str, Any]:
         )
     if version < OLDEST_VERSION:
         raise CheckpointError(f"{folder} has format {version}, which is not read any more; export the model again")
+    check_facts(facts, path)
     return facts
 
 
@@ -91,8 +93,12 @@ class ExportedSystem:
             self.features: Mapping[str, Any] = facts["features"]
             self.origin, self.scale = np.array(facts["world"]["origin"]), float(facts["world"]["scale"])
             self.keypoints = read_keypoint_settings(self.features) if "keypoints" in self.features else None
-            self.network = Network(find_file(folder, facts["network"])) if facts["network"] else None
-            self.map = ExportedMap(folder, facts["map"], self.scale) if facts["map"] else None
+            self.network = Network(check_part(folder, facts, facts["network"])) if facts["network"] else None
+            self.map = (
+                ExportedMap(check_part(folder, facts, facts["map"]["file"]), facts["map"], self.scale)
+                if facts["map"]
+                else None
+            )
         except (KeyError, TypeError, ValueError) as error:
             raise CheckpointError(f"{folder}/localizer.json lacks {error}; export the model again") from error
 
@@ -233,18 +239,18 @@ class ExportedMap:
     """The landmark map of a folder.
 
     Args:
-        folder: that `export` wrote.
+        file: its arrays.
         facts: of the map, in `localizer.json`.
         scale: of the map's positions in the scene's unit.
     """
 
-    def __init__(self, folder: Path, facts: Mapping[str, Any], scale: float) -> None:
+    def __init__(self, file: Path, facts: Mapping[str, Any], scale: float) -> None:
         self.settings = read_keypoint_settings(facts)
         camera = facts["camera"]
         self.view = Camera(**camera | {"distortion": tuple(camera["distortion"])})
         self.factors = [math.nan if factor is None else float(factor) for factor in facts["calibration"]]
         self.scale = scale
-        self.localizer = MapLocalizer(PointMap(**read_tensors(find_file(folder, facts["file"]))))
+        self.localizer = MapLocalizer(PointMap(**read_tensors(file)))
 
     def locate(self, found: Keypoints, camera: Camera | None, prior: CameraPose | None) -> MapAnswer:
         """Where an image with these keypoints was taken; the prior is in the map's unit."""
@@ -274,24 +280,18 @@ class ExportedMap:
         return radius_m, radius_deg, change @ answer.covariance @ change.T
 
 
-def find_file(folder: Path, name: str) -> Path:
-    """A file that `localizer.json` names.
-
-    Raises:
-        CheckpointError: it is not directly in the folder.
-    """
-    if Path(name).name != name:
-        raise CheckpointError(
-            f"{folder}/localizer.json names a file outside the folder: {name}; export the model again"
-        )
-    return folder / name
-
-
 def read_keypoint_settings(facts: Mapping[str, Any]) -> KeypointSettings:
     """The extractor in a part of `localizer.json`."""
     return KeypointSettings(**facts["keypoints"])
 
 
 def load_system(source: str | Path, allow: Sequence[str] = (), tracking_uri: str | None = None) -> ExportedSystem:
-    """The system of a folder; the other two arguments are for checkpoints, which cannot be read here."""
-    return ExportedSystem(Path(source).expanduser())
+    """The system of a folder; the other two arguments are for checkpoints, which cannot be read here.
+
+    Raises:
+        CheckpointError: as `ExportedSystem`, or this file itself is damaged.
+    """
+    folder, own = Path(source).expanduser(), Path(__file__)
+    if own.resolve().parent == folder.resolve():  # else it may be another version's
+        check_part(folder, read_facts(folder), own.name)
+    return ExportedSystem(folder)

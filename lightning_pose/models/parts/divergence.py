@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import torch
 from torch import Tensor
@@ -18,6 +18,10 @@ WORSE = 3.0
 """Positions off by this many times the training positions' spread are worse than any constant answer."""
 
 
+MOST_STEPS = 1000
+"""Steps that are looked at together, so that an epoch of hours does not go on after its loss is no number."""
+
+
 class DivergenceWatch:
     """Collects losses and errors of training steps on their device, and compares them once an epoch.
 
@@ -29,23 +33,38 @@ class DivergenceWatch:
 
     Attributes:
         spread_m: mean distance of the training positions from their mean; 0 for one position, which sets no bound.
+        names: of the scene's frames, for messages; their numbers stand in for missing ones.
     """
 
     def __init__(self) -> None:
         self.spread_m = 0.0
+        self.names: Sequence[str] = ()
         self._first: Tensor | None = None
-        self._sums: Tensor | None = None
-        self._steps = 0
+        self._steps: list[Tensor] = []  # loss and position error
+        self._frames: list[Tensor] = []
+        self._done: list[tuple[float, float]] = []  # of the epoch's steps that have been looked at
         self._epochs: list[tuple[float, float]] = []  # loss and position error of the first and the last epoch
 
-    def add_step(self, loss: Tensor, position_hat: Tensor, position_m: Tensor) -> None:
-        """Add the loss and the positions (..., 3) of one training step."""
+    def add_step(self, loss: Tensor, position_hat: Tensor, position_m: Tensor, frame: Tensor, remedy: str) -> None:
+        """Add one training step.
+
+        Args:
+            loss: of the step.
+            position_hat: (..., 3), of the network.
+            position_m: (..., 3), of the batch.
+            frame: of the batch, indices of frames in the scene.
+            remedy: as for `check_epoch`.
+
+        Raises:
+            ConfigError: training has diverged; it is looked at every 1000 steps.
+        """
         error = (position_hat.detach() - position_m).norm(dim=-1).mean()
         if self._first is None:
             self._first = error
-        step = torch.stack([loss.detach().to(error.dtype), error])
-        self._sums = step if self._sums is None else self._sums + step
-        self._steps += 1
+        self._steps.append(torch.stack([loss.detach().to(error.dtype), error]))
+        self._frames.append(frame)
+        if len(self._steps) == MOST_STEPS:
+            self._check_steps(remedy)
 
     def check_epoch(self, remedy: str) -> None:
         """Compare the steps since the last check, and forget them.
@@ -56,14 +75,37 @@ class DivergenceWatch:
         Raises:
             ConfigError: training has diverged.
         """
-        if self._sums is None:
+        self._check_steps(remedy)
+        if not self._done:
             return
-        loss, error = (self._sums / self._steps).tolist()
-        self._sums, self._steps = None, 0
-        if not math.isfinite(loss):
-            raise ConfigError(f"training has diverged: the loss is {loss}; {remedy}")
+        loss, error = (sum(values) / len(values) for values in zip(*self._done, strict=True))
+        self._done = []
         self.check_error(error, remedy)
         self._epochs = [*self._epochs[:1], (loss, error)]
+
+    def _check_steps(self, remedy: str) -> None:
+        """Look at the losses of the steps since the last time.
+
+        Raises:
+            ConfigError: one is no finite number.
+        """
+        if not self._steps:
+            return
+        values, frames = torch.stack(self._steps).tolist(), self._frames
+        self._steps, self._frames = [], []
+        bad = next((i for i, (loss, _) in enumerate(values) if not math.isfinite(loss)), None)
+        if bad is not None:
+            batch, shown = frames[bad].flatten().unique().tolist(), 3
+            named = ", ".join(self._name_frame(int(i)) for i in batch[:shown]) + (", ..." if len(batch) > shown else "")
+            number = len(self._done) + bad + 1
+            raise ConfigError(
+                f"training has diverged: the loss is {values[bad][0]} in batch {number} of the epoch (frames {named}); "
+                f"{remedy}"
+            )
+        self._done += [(loss, error) for loss, error in values]
+
+    def _name_frame(self, frame: int) -> str:
+        return self.names[frame] if frame < len(self.names) else str(frame)
 
     def describe_growth(self) -> str | None:
         """What is wrong with a training that has ended farther off than it began; None if nothing is."""

@@ -6,14 +6,17 @@ import pytest
 import torch
 
 from lightning_pose.errors import ConfigError
+from lightning_pose.models.parts import divergence
 from lightning_pose.models.parts.divergence import DivergenceWatch
+
+FRAMES = torch.tensor([4])
 
 
 def watch_steps(*errors: float, loss: float = 1.0) -> DivergenceWatch:
     watch = DivergenceWatch()
     watch.spread_m = 1.0
     for error in errors:
-        watch.add_step(torch.tensor(loss), torch.tensor([[error, 0.0, 0.0]]), torch.zeros(1, 3))
+        watch.add_step(torch.tensor(loss), torch.tensor([[error, 0.0, 0.0]]), torch.zeros(1, 3), FRAMES, "lower it")
     return watch
 
 
@@ -31,8 +34,22 @@ def test_errors_that_explode(errors: tuple[float, ...]) -> None:
 
 @pytest.mark.parametrize("loss", [float("nan"), float("inf")])
 def test_a_loss_that_is_no_number(loss: float) -> None:
-    with pytest.raises(ConfigError, match=f"the loss is {loss}"):
-        watch_steps(1.0, loss=loss).check_epoch("")
+    with pytest.raises(ConfigError, match=rf"the loss is {loss} in batch 1 of the epoch \(frames 4\); lower it"):
+        watch_steps(1.0, loss=loss).check_epoch("lower it")
+
+
+def test_the_batch_and_its_frames_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also before the end of a long epoch."""
+    monkeypatch.setattr(divergence, "MOST_STEPS", 4)
+    watch = DivergenceWatch()
+    watch.names = [f"seq-01/{number}.png" for number in range(6)]
+    losses = [torch.tensor(value) for value in (1.0, 1.0, 1.0, 1.0, 1.0, torch.nan, torch.nan)]
+    for loss in losses:
+        watch.add_step(loss, torch.zeros(5, 3), torch.zeros(5, 3), torch.tensor([5, 3, 2, 1, 9]), "lower it")
+    with pytest.raises(
+        ConfigError, match=r"batch 6 of the epoch \(frames seq-01/1.png, seq-01/2.png, seq-01/3.png, \.\.\."
+    ):
+        watch.add_step(losses[0], torch.zeros(5, 3), torch.zeros(5, 3), torch.tensor([0]), "lower it")
 
 
 def test_weights_that_are_no_numbers() -> None:
@@ -45,7 +62,7 @@ def test_a_training_that_ends_worse_than_it_began() -> None:
         watch = DivergenceWatch()
         watch.spread_m = 1.0
         for error in (1.0, ends):
-            watch.add_step(torch.tensor(error), torch.tensor([[error, 0.0, 0.0]]), torch.zeros(1, 3))
+            watch.add_step(torch.tensor(error), torch.tensor([[error, 0.0, 0.0]]), torch.zeros(1, 3), FRAMES, "")
             watch.check_epoch("")
         growth = watch.describe_growth()
         assert (growth is not None) == grown
@@ -61,12 +78,12 @@ def test_a_far_start_or_a_single_epoch_is_no_growth() -> None:
 
 def test_one_training_frame_sets_no_bound_to_the_others() -> None:
     watch = DivergenceWatch()
-    watch.add_step(torch.tensor(0.0), torch.zeros(1, 3), torch.zeros(1, 3))
+    watch.add_step(torch.tensor(0.0), torch.zeros(1, 3), torch.zeros(1, 3), FRAMES, "")
     watch.check_error(0.5, "")
 
 
 def test_frames_at_one_place() -> None:
     watch = DivergenceWatch()
-    watch.add_step(torch.tensor(0.0), torch.zeros(1, 3), torch.zeros(1, 3))
-    watch.add_step(torch.tensor(0.0), torch.full((1, 3), 1e-4), torch.zeros(1, 3))
+    watch.add_step(torch.tensor(0.0), torch.zeros(1, 3), torch.zeros(1, 3), FRAMES, "")
+    watch.add_step(torch.tensor(0.0), torch.full((1, 3), 1e-4), torch.zeros(1, 3), FRAMES, "")
     watch.check_epoch("")
