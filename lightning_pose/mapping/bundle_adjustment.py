@@ -17,7 +17,7 @@ from lightning_pose.geometry.rolling_shutter import derive_rolling
 from lightning_pose.geometry.triangulation import sum_by_track
 from lightning_pose.mapping.frames import MapFrames, find_turn_rates
 
-__all__ = ["Adjustment", "CameraCorrection", "adjust_bundle", "measure_pose_sd"]
+__all__ = ["POSE_SD", "Adjustment", "CameraCorrection", "adjust_bundle", "measure_pose_sd"]
 
 CAUCHY_PX = 2.0
 """Scale of Cauchy's weights on image errors, which is also the errors' standard deviation."""
