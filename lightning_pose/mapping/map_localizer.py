@@ -23,9 +23,20 @@ RANSAC_PX = 6.0
 SIGMA_PX = 1.0
 """Scale of Cauchy's weights in the last refinement."""
 
+PLACE_VARIANCE = 10.0
+"""Variance of the errors that place a point, by that of an image's: errors of the map's poses do not average out."""
+
 INLIER_PX = 3.0
 ACCEPT_INLIERS = 20
 """Guided matches within 3 px that an accepted pose needs. With 12, poses came through that were metres off."""
+
+ACCEPT_FEW = 12
+ACCEPT_SHARE = 0.04
+"""So few are enough, if they are this share of the points in view."""
+
+ACCEPT_SD = (0.03, 1.5)
+ACCEPT_SD_OF_FEW = (0.018, 1.0)
+"""Standard deviations that an accepted pose may have: in median depths, and degrees."""
 
 PRIOR = (0.5, 30.0)
 """How far a pose may lie from a prior: in median depths of the map's points, and degrees."""
@@ -130,6 +141,7 @@ class MapLocalizer:
         distance = np.linalg.norm(point_map.points[point] - point_map.position[frame], axis=1)
         self._depth = float(np.median(distance)) if len(distance) else 1.0
         self._kernel = KERNEL[0] * self._depth
+        self._covariance = point_map.measure_covariances()
 
     def locate(self, query: MapQuery, prior: CameraPose | None = None) -> MapAnswer:
         """Where the image was taken: candidates, matches, RANSAC, one guided pass, refinement.
@@ -194,14 +206,14 @@ class MapLocalizer:
             return self._refuse(frame, f"weak geometry: no pose agrees with four of {len(rows)} matches")
         pose, mask = found
         sigma = SIGMA_PX / query.focal_px
-        refined = self._refine(pose, self.map.points[matched[mask]], points[rows[mask]], 2 * sigma, steps=3)
+        refined = self._refine(pose, matched[mask], points[rows[mask]], 2 * sigma, steps=3)
         for _ in range(MOST_PASSES):
             still = remove_rolling(points, refined.turn)
             rows, matched, seen = self._matcher.match_guided(query, still, refined.pose)
             visible = len(seen)
             if len(rows) < MIN_MATCHES:
                 return self._refuse(frame, f"too few guided matches: {len(rows)} of {visible} points in view", visible)
-            refined = self._refine(refined.pose, self.map.points[matched], points[rows], sigma)
+            refined = self._refine(refined.pose, matched, points[rows], sigma)
             observed = remove_rolling(points[rows], refined.turn)
             local = (self.map.points[matched] - refined.pose.position) @ refined.pose.rotation
             projected = local[:, :2] / np.maximum(local[:, 2:], 1e-9)
@@ -209,31 +221,53 @@ class MapLocalizer:
             inliers = int(inlier.sum())
             if inliers >= SURE_INLIERS:
                 break
-        reason = "" if inliers >= ACCEPT_INLIERS else f"too few guided inliers: {inliers} of {visible} points in view"
-        return self._answer(refined, inliers, visible, reason, ShownPoints(seen, projected, observed, inlier))
+        return self._answer(refined, inliers, visible, ShownPoints(seen, projected, observed, inlier))
 
     def _refine(
-        self, pose: CameraPose, points: np.ndarray, observed: np.ndarray, sigma: float, steps: int = 8
+        self, pose: CameraPose, matched: np.ndarray, observed: np.ndarray, sigma: float, steps: int = 8
     ) -> TurningPose:
-        """The pose that fits points (N, 3) seen at (N, 2) best, and how the camera turned if the map's did."""
-        if self._turn_sd > 0:
-            return refine_turning_pose(pose, points, observed, sigma, self._turn_sd, steps)
-        return TurningPose(*refine_pose(pose, points, observed, sigma, steps), np.zeros(3))
+        """The pose that fits points `matched` (N,) seen at (N, 2) best, and how the camera turned if the map's did.
 
-    def _answer(self, refined: TurningPose, inliers: int, visible: int, reason: str, shown: ShownPoints) -> MapAnswer:
+        Points count less whose own places are uncertain across the line of sight.
+        """
+        points = self.map.points[matched]
+        ray = points - pose.position
+        squared = (ray**2).sum(axis=1)
+        covariance = self._covariance[matched]
+        along = np.einsum("ni,nij,nj->n", ray, covariance, ray) / squared
+        across = (np.trace(covariance, axis1=1, axis2=2) - along) / (2 * squared)
+        sigmas = sigma * np.sqrt(1 + PLACE_VARIANCE * across)
+        if self._turn_sd > 0:
+            return refine_turning_pose(pose, points, observed, sigmas, self._turn_sd, steps)
+        return TurningPose(*refine_pose(pose, points, observed, sigmas, steps), np.zeros(3))
+
+    def _answer(self, refined: TurningPose, inliers: int, visible: int, shown: ShownPoints) -> MapAnswer:
         covariance = np.linalg.pinv(refined.normal, hermitian=True)
         spread = np.maximum(np.diag(covariance), 0.0)
+        position_sd, turn_sd_deg = float(np.sqrt(spread[3:].sum())), float(np.degrees(np.sqrt(spread[:3].sum())))
+        reason = self._judge(inliers, visible, position_sd, turn_sd_deg)
         return MapAnswer(
             self.carry_back(refined.pose, refined.turn),
             refined.pose,
             inliers,
             visible,
             reason,
-            float(np.sqrt(spread[3:].sum())),
-            float(np.degrees(np.sqrt(spread[:3].sum()))),
+            position_sd,
+            turn_sd_deg,
             covariance,
             shown,
         )
+
+    def _judge(self, inliers: int, visible: int, position_sd: float, orientation_sd_deg: float) -> str:
+        """Why a pose is refused; empty if it is accepted."""
+        few = inliers < ACCEPT_INLIERS
+        if few and (inliers < ACCEPT_FEW or inliers < ACCEPT_SHARE * visible):
+            return f"too few guided inliers: {inliers} of {visible} points in view"
+        away, turned = position_sd / self._depth, orientation_sd_deg
+        most_away, most_turned = ACCEPT_SD_OF_FEW if few else ACCEPT_SD
+        if inliers < SURE_INLIERS and (away > most_away or turned > most_turned):
+            return f"weak geometry: standard deviations of {away:.2g} median depths and {turned:.2g} degrees"
+        return ""
 
     def _refuse(self, frame: int, reason: str, visible: int = 0) -> MapAnswer:
         frame = int(self._kept[0]) if frame < 0 else frame
