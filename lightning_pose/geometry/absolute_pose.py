@@ -69,7 +69,7 @@ def find_pose_ransac(
 
 
 def refine_pose(
-    pose: CameraPose, points: np.ndarray, observed: np.ndarray, sigma: float, steps: int = 8
+    pose: CameraPose, points: np.ndarray, observed: np.ndarray, sigma: float | np.ndarray, steps: int = 8
 ) -> RefinedPose:
     """Gauss-Newton on the image errors with Cauchy's weights.
 
@@ -77,7 +77,7 @@ def refine_pose(
         pose: where to start.
         points: (N, 3), in the world.
         observed: (N, 2), normalised image coordinates.
-        sigma: scale of Cauchy's weights, in normalised image coordinates.
+        sigma: scale of Cauchy's weights, in normalised image coordinates; one, or (N,).
         steps: at most; fewer when the pose no longer moves.
     """
     rotation, position = pose

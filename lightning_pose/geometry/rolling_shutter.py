@@ -45,7 +45,7 @@ def remove_rolling(points: np.ndarray, turn: np.ndarray) -> np.ndarray:
 
 
 def refine_turning_pose(
-    pose: CameraPose, points: np.ndarray, observed: np.ndarray, sigma: float, turn_sd: float, steps: int = 8
+    pose: CameraPose, points: np.ndarray, observed: np.ndarray, sigma: float | np.ndarray, turn_sd: float, steps: int = 8
 ) -> TurningPose:
     """Gauss-Newton with Cauchy's weights, as `refine_pose`, on the pose and on how the camera turned.
 
@@ -53,7 +53,7 @@ def refine_turning_pose(
         pose: where to start.
         points: (N, 3), in the world.
         observed: (N, 2), normalised image coordinates.
-        sigma: scale of Cauchy's weights, in normalised image coordinates.
+        sigma: scale of Cauchy's weights, in normalised image coordinates; one, or (N,).
         turn_sd: standard deviation of each component of the turn, above 0; the prior of a turn is
             normal with mean 0.
         steps: at most; fewer when the pose no longer moves.

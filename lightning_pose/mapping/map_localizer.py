@@ -24,6 +24,9 @@ SIGMA_PX = 1.0
 """Scale of Cauchy's weights in the last refinement."""
 
 INLIER_PX = 3.0
+PLACE_VARIANCE = 10.0
+"""Variance of the images' errors that place a point, by that of an image's errors: poses of the map share theirs."""
+
 ACCEPT_INLIERS = 20
 """Guided matches within 3 px that an accepted pose needs. With 12, poses came through that were metres off."""
 
@@ -136,6 +139,7 @@ class MapLocalizer:
         distance = np.linalg.norm(point_map.points[point] - point_map.position[frame], axis=1)
         self._depth = float(np.median(distance)) if len(distance) else 1.0
         self._learn_offsets()
+        self._places_cov = measure_places(point_map)
 
     def locate(self, query: MapQuery, prior: CameraPose | None = None) -> MapAnswer:
         """Where the image was taken: candidates, matches, RANSAC, one guided pass, refinement.
@@ -200,14 +204,14 @@ class MapLocalizer:
             return self._refuse(frame, f"weak geometry: no pose agrees with four of {len(rows)} matches")
         pose, mask = found
         sigma = SIGMA_PX / query.focal_px
-        refined = self._refine(pose, self.map.points[matched[mask]], points[rows[mask]], 2 * sigma, steps=3)
+        refined = self._refine(pose, matched[mask], points[rows[mask]], 2 * sigma, steps=3)
         for _ in range(MOST_PASSES):
             still = remove_rolling(points, refined.turn)
             rows, matched, seen = self._matcher.match_guided(query, still, refined.pose)
             visible = len(seen)
             if len(rows) < MIN_MATCHES:
                 return self._refuse(frame, f"too few guided matches: {len(rows)} of {visible} points in view", visible)
-            refined = self._refine(refined.pose, self.map.points[matched], points[rows], sigma)
+            refined = self._refine(refined.pose, matched, points[rows], sigma)
             observed = remove_rolling(points[rows], refined.turn)
             local = (self.map.points[matched] - refined.pose.position) @ refined.pose.rotation
             projected = local[:, :2] / np.maximum(local[:, 2:], 1e-9)
@@ -219,12 +223,22 @@ class MapLocalizer:
         return self._answer(refined, inliers, visible, reason, ShownPoints(seen, projected, observed, inlier))
 
     def _refine(
-        self, pose: CameraPose, points: np.ndarray, observed: np.ndarray, sigma: float, steps: int = 8
+        self, pose: CameraPose, matched: np.ndarray, observed: np.ndarray, sigma: float, steps: int = 8
     ) -> TurningPose:
-        """The pose that fits points (N, 3) seen at (N, 2) best, and how the camera turned if the map's did."""
+        """The pose that fits points `matched` (N,) seen at (N, 2) best, and how the camera turned if the map's did.
+
+        Points count less whose own places are uncertain across the line of sight.
+        """
+        points = self.map.points[matched]
+        ray = points - pose.position
+        squared = (ray**2).sum(axis=1)
+        covariance = self._places_cov[matched]
+        along = np.einsum("ni,nij,nj->n", ray, covariance, ray) / squared
+        across = (np.trace(covariance, axis1=1, axis2=2) - along) / (2 * squared)
+        sigmas = sigma * np.sqrt(1 + PLACE_VARIANCE * across)
         if self._turn_sd > 0:
-            return refine_turning_pose(pose, points, observed, sigma, self._turn_sd, steps)
-        return TurningPose(*refine_pose(pose, points, observed, sigma, steps), np.zeros(3))
+            return refine_turning_pose(pose, points, observed, sigmas, self._turn_sd, steps)
+        return TurningPose(*refine_pose(pose, points, observed, sigmas, steps), np.zeros(3))
 
     def _answer(self, refined: TurningPose, inliers: int, visible: int, reason: str, shown: ShownPoints) -> MapAnswer:
         covariance = np.linalg.pinv(refined.normal, hermitian=True)
@@ -291,6 +305,21 @@ class MapLocalizer:
         """(6,) rotation vector and movement, in a camera's axes, from the map to given poses."""
         alike = _compare_places(self._embed(pose.rotation[None], pose.position[None]), self._places)[0]
         return self._mean_offset + alike @ self._learnt
+
+
+def measure_places(point_map: PointMap) -> np.ndarray:
+    """(P, 3, 3) covariances of the points, if images err by 1 in normalised coordinates."""
+    point, frame = point_map.seen_point.astype(np.int64), point_map.seen_frame
+    ray = point_map.points[point] - point_map.position[frame]
+    squared = np.maximum((ray**2).sum(axis=1), np.finfo(float).tiny)
+    row, column = np.triu_indices(3)
+    sums = [np.bincount(point, 1 / squared, len(point_map))]
+    sums += [np.bincount(point, ray[:, i] * ray[:, j] / squared**2, len(point_map)) for i, j in zip(row, column)]
+    normal = np.empty((len(point_map), 3, 3))
+    for i, j, total in zip(row, column, sums[1:], strict=True):
+        normal[:, i, j] = normal[:, j, i] = (sums[0] if i == j else 0) - total
+    trace = np.trace(normal, axis1=1, axis2=2)[:, None, None]
+    return np.linalg.inv(normal + np.eye(3) * (1e-6 * trace + np.finfo(float).tiny))
 
 
 def _compare_places(a: np.ndarray, b: np.ndarray) -> np.ndarray:
