@@ -30,6 +30,14 @@ PLACE_VARIANCE = 10.0
 ACCEPT_INLIERS = 20
 """Guided matches within 3 px that an accepted pose needs. With 12, poses came through that were metres off."""
 
+ACCEPT_FEW = 12
+ACCEPT_SHARE = 0.04
+"""So few are enough, if they are this share of the points in view."""
+
+ACCEPT_SD = (0.03, 1.5)
+ACCEPT_SD_OF_FEW = (0.018, 1.0)
+"""Standard deviations that an accepted pose may have: in median depths, and degrees."""
+
 PRIOR = (0.5, 30.0)
 """How far a pose may lie from a prior: in median depths of the map's points, and degrees."""
 
@@ -219,8 +227,7 @@ class MapLocalizer:
             inliers = int(inlier.sum())
             if inliers >= SURE_INLIERS:
                 break
-        reason = "" if inliers >= ACCEPT_INLIERS else f"too few guided inliers: {inliers} of {visible} points in view"
-        return self._answer(refined, inliers, visible, reason, ShownPoints(seen, projected, observed, inlier))
+        return self._answer(refined, inliers, visible, ShownPoints(seen, projected, observed, inlier))
 
     def _refine(
         self, pose: CameraPose, matched: np.ndarray, observed: np.ndarray, sigma: float, steps: int = 8
@@ -240,20 +247,33 @@ class MapLocalizer:
             return refine_turning_pose(pose, points, observed, sigmas, self._turn_sd, steps)
         return TurningPose(*refine_pose(pose, points, observed, sigmas, steps), np.zeros(3))
 
-    def _answer(self, refined: TurningPose, inliers: int, visible: int, reason: str, shown: ShownPoints) -> MapAnswer:
+    def _answer(self, refined: TurningPose, inliers: int, visible: int, shown: ShownPoints) -> MapAnswer:
         covariance = np.linalg.pinv(refined.normal, hermitian=True)
         spread = np.maximum(np.diag(covariance), 0.0)
+        position_sd, turn_sd_deg = float(np.sqrt(spread[3:].sum())), float(np.degrees(np.sqrt(spread[:3].sum())))
+        reason = self._judge(inliers, visible, position_sd, turn_sd_deg)
         return MapAnswer(
             self.carry_back(refined.pose, refined.turn),
             refined.pose,
             inliers,
             visible,
             reason,
-            float(np.sqrt(spread[3:].sum())),
-            float(np.degrees(np.sqrt(spread[:3].sum()))),
+            position_sd,
+            turn_sd_deg,
             covariance,
             shown,
         )
+
+    def _judge(self, inliers: int, visible: int, position_sd: float, orientation_sd_deg: float) -> str:
+        """Why a pose is refused; empty if it is accepted."""
+        few = inliers < ACCEPT_INLIERS
+        if few and (inliers < ACCEPT_FEW or inliers < ACCEPT_SHARE * visible):
+            return f"too few guided inliers: {inliers} of {visible} points in view"
+        away, turned = position_sd / self._depth, orientation_sd_deg
+        most_away, most_turned = ACCEPT_SD_OF_FEW if few else ACCEPT_SD
+        if inliers < SURE_INLIERS and (away > most_away or turned > most_turned):
+            return f"weak geometry: standard deviations of {away:.2g} median depths and {turned:.2g} degrees"
+        return ""
 
     def _refuse(self, frame: int, reason: str, visible: int = 0) -> MapAnswer:
         frame = int(self._kept[0]) if frame < 0 else frame
