@@ -45,7 +45,12 @@ def remove_rolling(points: np.ndarray, turn: np.ndarray) -> np.ndarray:
 
 
 def refine_turning_pose(
-    pose: CameraPose, points: np.ndarray, observed: np.ndarray, sigma: float | np.ndarray, turn_sd: float, steps: int = 8
+    pose: CameraPose,
+    points: np.ndarray,
+    observed: np.ndarray,
+    sigma: float | np.ndarray,
+    turn_sd: float,
+    steps: int = 8,
 ) -> TurningPose:
     """Gauss-Newton with Cauchy's weights, as `refine_pose`, on the pose and on how the camera turned.
 

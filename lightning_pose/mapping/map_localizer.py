@@ -23,10 +23,10 @@ RANSAC_PX = 6.0
 SIGMA_PX = 1.0
 """Scale of Cauchy's weights in the last refinement."""
 
-INLIER_PX = 3.0
 PLACE_VARIANCE = 10.0
-"""Variance of the images' errors that place a point, by that of an image's errors: poses of the map share theirs."""
+"""Variance of the errors that place a point, by that of an image's: errors of the map's poses do not average out."""
 
+INLIER_PX = 3.0
 ACCEPT_INLIERS = 20
 """Guided matches within 3 px that an accepted pose needs. With 12, poses came through that were metres off."""
 
@@ -48,14 +48,8 @@ SURE_INLIERS = 40
 MOST_PASSES = 3
 """Guided passes; after each, fewer inliers than that are matched anew from the better pose."""
 
-ALIKE = (0.35, 30.0)
-"""How far poses lie apart whose offsets are still alike: in median depths of the map's points, and degrees."""
-
-OFFSET_NOISE = 0.2
-"""Variance of a training frame's own error in its offset, by that of the offsets."""
-
-MOST_FRAMES = 1000
-"""Training frames, evenly taken, of which offsets are learnt."""
+KERNEL = (0.05, 5.0)
+"""How far training frames lend their offset to an answer: in median depths of the map's points, and degrees."""
 
 AROUND = 15
 """Frames before and after each over which the drift of the given poses hardly changes, while the camera's turn does."""
@@ -146,8 +140,8 @@ class MapLocalizer:
         frame, point = point_map.seen_frame, point_map.seen_point
         distance = np.linalg.norm(point_map.points[point] - point_map.position[frame], axis=1)
         self._depth = float(np.median(distance)) if len(distance) else 1.0
-        self._learn_offsets()
-        self._places_cov = measure_places(point_map)
+        self._kernel = KERNEL[0] * self._depth
+        self._covariance = point_map.measure_covariances()
 
     def locate(self, query: MapQuery, prior: CameraPose | None = None) -> MapAnswer:
         """Where the image was taken: candidates, matches, RANSAC, one guided pass, refinement.
@@ -239,7 +233,7 @@ class MapLocalizer:
         points = self.map.points[matched]
         ray = points - pose.position
         squared = (ray**2).sum(axis=1)
-        covariance = self._places_cov[matched]
+        covariance = self._covariance[matched]
         along = np.einsum("ni,nij,nj->n", ray, covariance, ray) / squared
         across = (np.trace(covariance, axis1=1, axis2=2) - along) / (2 * squared)
         sigmas = sigma * np.sqrt(1 + PLACE_VARIANCE * across)
@@ -289,7 +283,7 @@ class MapLocalizer:
         """
         if not self._adjusted:
             return pose
-        offset = self._find_offset(pose)
+        offset = self._mean_offset(pose, self.map.rotation, self.map.position)
         if turn is not None:
             offset = offset + turn @ self._by_turn
         back = Rotation.from_rotvec(offset[:3]).as_matrix()
@@ -299,53 +293,19 @@ class MapLocalizer:
         """Where the map would put a camera at a pose that the dataset gives: the other way round."""
         if not self._adjusted:
             return pose
-        rotation, position = pose
-        for _ in range(3):  # the offset hardly changes from the one place to the other
-            offset = self._find_offset(CameraPose(rotation, position))
-            rotation = pose.rotation @ Rotation.from_rotvec(-offset[:3]).as_matrix()
-            position = pose.position - rotation @ offset[3:]
-        return CameraPose(rotation, position)
+        offset = self._mean_offset(pose, self.map.given_rotation, self.map.given_position)
+        rotation = pose.rotation @ Rotation.from_rotvec(-offset[:3]).as_matrix()
+        return CameraPose(rotation, pose.position - rotation @ offset[3:])
 
-    def _learn_offsets(self) -> None:
-        """A Gaussian process of the training frames' offsets over their poses (Rasmussen, Williams, 2006)."""
-        offsets = np.concatenate([self._turn_back, self._move_back], axis=1)
-        rows = np.unique(np.linspace(0, len(offsets) - 1, min(len(offsets), MOST_FRAMES)).round().astype(int))
-        self._mean_offset = offsets.mean(axis=0)
-        self._places = self._embed(self.map.rotation[self._kept[rows]], self.map.position[self._kept[rows]])
-        if self._adjusted:
-            alike = _compare_places(self._places, self._places) + OFFSET_NOISE * np.eye(len(rows))
-            self._learnt = np.linalg.solve(alike, offsets[rows] - self._mean_offset)
-
-    def _embed(self, rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
-        """(F, 12) of poses: their distance is 1 where the offsets are less alike by a factor exp(-1/2)."""
-        turned = rotation.reshape(len(rotation), 9) / (np.sqrt(2) * np.radians(ALIKE[1]))
-        return np.concatenate([position / (ALIKE[0] * self._depth), turned], axis=1)
-
-    def _find_offset(self, pose: CameraPose) -> np.ndarray:
-        """(6,) rotation vector and movement, in a camera's axes, from the map to given poses."""
-        alike = _compare_places(self._embed(pose.rotation[None], pose.position[None]), self._places)[0]
-        return self._mean_offset + alike @ self._learnt
-
-
-def measure_places(point_map: PointMap) -> np.ndarray:
-    """(P, 3, 3) covariances of the points, if images err by 1 in normalised coordinates."""
-    point, frame = point_map.seen_point.astype(np.int64), point_map.seen_frame
-    ray = point_map.points[point] - point_map.position[frame]
-    squared = np.maximum((ray**2).sum(axis=1), np.finfo(float).tiny)
-    row, column = np.triu_indices(3)
-    sums = [np.bincount(point, 1 / squared, len(point_map))]
-    sums += [np.bincount(point, ray[:, i] * ray[:, j] / squared**2, len(point_map)) for i, j in zip(row, column)]
-    normal = np.empty((len(point_map), 3, 3))
-    for i, j, total in zip(row, column, sums[1:], strict=True):
-        normal[:, i, j] = normal[:, j, i] = (sums[0] if i == j else 0) - total
-    trace = np.trace(normal, axis1=1, axis2=2)[:, None, None]
-    return np.linalg.inv(normal + np.eye(3) * (1e-6 * trace + np.finfo(float).tiny))
-
-
-def _compare_places(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(A, B): how alike the offsets at places (A, 12) and (B, 12) are, at most 1."""
-    squared = (a**2).sum(axis=1)[:, None] + (b**2).sum(axis=1) - 2 * a @ b.T
-    return np.exp(-0.5 * np.maximum(squared, 0.0))
+    def _mean_offset(self, pose: CameraPose, rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
+        """(6,) rotation vector and movement, in a camera's axes, from the map to given poses, of near frames."""
+        away = np.linalg.norm(position[self._kept] - pose.position, axis=1) / self._kernel
+        cosine = (np.einsum("fij,ij->f", rotation[self._kept], pose.rotation) - 1) / 2
+        turned = np.degrees(np.arccos(np.clip(cosine, -1, 1))) / KERNEL[1]
+        squared = away**2 + turned**2
+        weight = np.exp(-0.5 * (squared - squared.min()))
+        weight /= weight.sum()
+        return np.concatenate([weight @ self._turn_back, weight @ self._move_back])
 
 
 def _subtract_mean(values: np.ndarray) -> np.ndarray:

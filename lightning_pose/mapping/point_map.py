@@ -74,6 +74,19 @@ class PointMap:
         """(O,) int64, the frame of each observation."""
         return np.repeat(np.arange(len(self.seen_count)), self.seen_count)
 
+    def measure_covariances(self) -> np.ndarray:
+        """(P, 3, 3) covariances of the points, if the frames that saw them err by 1 in normalised coordinates."""
+        point, n = self.seen_point.astype(np.int64), len(self)
+        ray = self.points[point] - self.position[self.seen_frame]
+        squared = np.maximum((ray**2).sum(axis=1), np.finfo(float).tiny)
+        across = np.bincount(point, 1 / squared, n)
+        normal = np.empty((n, 3, 3))
+        for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)):
+            along = np.bincount(point, ray[:, i] * ray[:, j] / squared**2, n)
+            normal[:, i, j] = normal[:, j, i] = (across if i == j else 0) - along
+        trace = np.trace(normal, axis1=1, axis2=2)[:, None, None]
+        return np.linalg.inv(normal + np.eye(3) * (1e-6 * trace + np.finfo(float).tiny))
+
     @property
     def n_bytes(self) -> int:
         """Size of all arrays."""
