@@ -120,6 +120,42 @@ def test_half_the_keypoints_wrong_still_locates(localizer: MapLocalizer, test: M
     assert np.linalg.norm(answer.pose.position - test.position[7]) < 0.02
 
 
+def test_few_inliers_are_enough_where_few_points_are_in_view(localizer: MapLocalizer, test: MapFrames) -> None:
+    """A query with some of its keypoints is accepted if its image is the part of the view that they fill."""
+    query, accepted = test.query(7), {}
+    known = localizer.locate(query)
+    assert known.shown is not None
+    used = known.shown.observed[known.shown.inlier][::8]
+    rows = np.flatnonzero((query.points[:, None] == used[None]).all(axis=2).any(axis=1))[:17]
+    few = replace(query, **{name: getattr(query, name)[rows] for name in ("points", "size_px", "descriptors")})
+    for name, half_view in (("whole", query.half_view), ("part", np.abs(few.points).max(axis=0) * 1.01)):
+        answer = localizer.locate(replace(few, half_view=half_view))
+        assert 12 <= answer.inliers < 20
+        accepted[name] = answer.accepted
+        assert answer.accepted == (answer.inliers >= 0.04 * answer.visible)
+    assert accepted["part"]
+
+
+def test_a_point_seen_under_a_wide_angle_has_the_smaller_covariance(localizer: MapLocalizer) -> None:
+    point_map = localizer.map
+    narrow, wide = (
+        replace(
+            point_map,
+            points=np.array([[0.0, 0, 2]]),
+            seen_point=np.zeros(2, np.int32),
+            seen_count=np.array([1, 1], np.int32),
+            position=np.array([[-x, 0, 0], [x, 0, 0]]),
+            direction=point_map.direction[:1],
+            log_size=point_map.log_size[:1],
+            descriptors=point_map.descriptors[:1],
+        ).measure_covariances()[0]
+        for x in (0.1, 1.0)
+    )
+    # Two rays of length about 2 across which a place is known to 2, each: across both, to 2 / sqrt(2).
+    np.testing.assert_allclose(np.diag(narrow)[:2], 2, rtol=0.02)
+    assert narrow[2, 2] > 50 * wide[2, 2]
+
+
 def test_a_radius_holds_nine_errors_of_ten() -> None:
     training = make_frames(*make_walk(90), noise_px=0.8)
     rotation, position_m = make_walk(60, seed=8)
