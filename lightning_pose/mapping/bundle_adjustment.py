@@ -119,10 +119,13 @@ def measure_pose_sd(
 
     Poses that the images hardly move are right in detail, and are held tighter from then on.
     """
+    if not len(track):
+        return POSE_SD
     problem = _Problem(state, given, track, frame, keypoint)
     moved, _ = problem.prior_errors(state)
     turn_sd, move_sd = (float(np.sqrt((part**2).mean())) for part in (moved[:, :3], moved[:, 3:] / problem.depth))
-    return min(turn_sd, POSE_SD[0]), min(move_sd, POSE_SD[1])
+    least = 1e-3 * POSE_SD[0], 1e-3 * POSE_SD[1]  # poses that nothing moves at all still may move
+    return float(np.clip(turn_sd, least[0], POSE_SD[0])), float(np.clip(move_sd, least[1], POSE_SD[1]))
 
 
 class _Problem:

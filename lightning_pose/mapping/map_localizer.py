@@ -31,8 +31,8 @@ ACCEPT_INLIERS = 20
 """Guided matches within 3 px that an accepted pose needs. With 12, poses came through that were metres off."""
 
 ACCEPT_FEW = 12
-ACCEPT_SHARE = 0.04
-"""So few are enough, if they are this share of the points in view."""
+ACCEPT_SHARE, ACCEPT_SHARE_OF_FEW = 0.015, 0.04
+"""Share of the points in view that must be inliers: chance matches grow with them. So few are enough if more are."""
 
 ACCEPT_SD = (0.03, 1.5)
 ACCEPT_SD_OF_FEW = (0.018, 1.0)
@@ -261,7 +261,8 @@ class MapLocalizer:
     def _judge(self, inliers: int, visible: int, position_sd: float, orientation_sd_deg: float) -> str:
         """Why a pose is refused; empty if it is accepted."""
         few = inliers < ACCEPT_INLIERS
-        if few and (inliers < ACCEPT_FEW or inliers < ACCEPT_SHARE * visible):
+        share = ACCEPT_SHARE_OF_FEW if few else ACCEPT_SHARE
+        if inliers < ACCEPT_FEW or (inliers < SURE_INLIERS and inliers < share * visible):
             return f"too few guided inliers: {inliers} of {visible} points in view"
         away, turned = position_sd / self._depth, orientation_sd_deg
         most_away, most_turned = ACCEPT_SD_OF_FEW if few else ACCEPT_SD
