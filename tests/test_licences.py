@@ -48,7 +48,7 @@ def collect(names: list[str]) -> dict[str, metadata.PackageMetadata]:
 
 def read_licence(about: metadata.PackageMetadata) -> str:
     """What a package says of its licence, without the text of the licence itself."""
-    stated = [about.get("License-Expression") or "", (about.get("License") or "")[:200]]
+    stated = [about[name][:200] for name in ("License-Expression", "License") if name in about]
     return "; ".join([*stated, *(text for text in about.get_all("Classifier") or () if text.startswith("License"))])
 
 

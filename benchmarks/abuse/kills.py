@@ -17,6 +17,7 @@ from mlflow import MlflowClient
 from benchmarks.abuse.signals import list_torn
 from benchmarks.abuse.table import Row
 from benchmarks.abuse.workplace import Workplace
+from lightning_pose.features.record_files import read_record
 from tests.processes import ForkedProcess
 
 __all__ = ["kill_commands", "kill_fits"]
@@ -140,8 +141,12 @@ def kill_commands(base: Workplace, times: int | None) -> Iterator[Row]:
 
 
 def _read_records(cache: Path) -> Mapping[str, bytes]:
-    """The content of all records of a feature cache, by their names."""
-    return {file.name: file.read_bytes() for file in cache.rglob("??/*.safetensors")}
+    """The arrays of all records of a feature cache, by their names; their order in a file is not always the same."""
+    found: dict[str, bytes] = {}
+    for file in cache.rglob("??/*.safetensors"):
+        record = read_record(file) or {}
+        found[file.name] = b"".join(name.encode() + record[name].tobytes() for name in sorted(record))
+    return found
 
 
 def _kill_command(

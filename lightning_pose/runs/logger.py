@@ -100,6 +100,7 @@ class MLflowLogger(MLFlowLogger):
             run_name=run_name,
             tracking_uri=uri,
             run_id=run_id,
+            tags=process_tags(),  # at once: a run without them could not be closed for a process that is killed now
             artifact_location=(Path(root) / "artifacts").resolve().as_uri() if local else None,
         )
         self._writer = BufferedClient(uri)

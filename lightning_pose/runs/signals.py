@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import os
 import signal
+import stat
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 
 __all__ = ["STOPPING", "delay_interrupts", "interrupt_on"]
 
-STOPPING = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+STOPPING: list[int] = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
 """Signals beside Ctrl-C's that end a command; Windows has no SIGHUP."""
 
 AGAIN_SECONDS = 10.0
@@ -29,6 +31,8 @@ def interrupt_on(signals: list[int]) -> Iterator[list[int]]:
 
     def handle(number: int, frame: FrameType | None) -> None:
         received.append(number)
+        if number == getattr(signal, "SIGHUP", None):
+            _leave_terminal()
         if not raised or time.monotonic() - raised[-1] > AGAIN_SECONDS:
             raised.append(time.monotonic())
             raise KeyboardInterrupt
@@ -36,6 +40,16 @@ def interrupt_on(signals: list[int]) -> Iterator[list[int]]:
     plain = (signal.SIG_DFL, signal.default_int_handler)
     with _replace_handlers([number for number in signals if signal.getsignal(number) in plain], handle):
         yield received
+
+
+def _leave_terminal() -> None:
+    """Write nothing more to a terminal that was closed: each attempt would be an error, and so break off the end."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for number in (1, 2):
+        with suppress(OSError):
+            if stat.S_ISCHR(os.fstat(number).st_mode):  # not a file, nor a pipe
+                os.dup2(nowhere, number)
+    os.close(nowhere)
 
 
 @contextmanager
@@ -46,7 +60,7 @@ def delay_interrupts() -> Iterator[None]:
     to close the run, waits 20 s and fails with "database is locked".
     """
     received: list[int] = []
-    signals = [number for number in (signal.SIGINT, *STOPPING) if callable(signal.getsignal(number))]
+    signals: list[int] = [number for number in (signal.SIGINT, *STOPPING) if callable(signal.getsignal(number))]
     with _replace_handlers(signals, lambda number, frame: received.append(number)):
         yield
     if received:

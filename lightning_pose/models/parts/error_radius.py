@@ -117,7 +117,7 @@ class ErrorRadius(nn.Module):
 
     def measure_excess(self, features: Tensor) -> Tensor:
         """(B,) distances by the largest that is accepted, so that above 1 is refused; nan where that is unknown."""
-        if not self.has_limit:
+        if not self.has_limit or self.limit is None:
             return torch.full((len(features),), torch.nan)
         return (self.measure_distance(features) / (self.limit * self.farthest)).cpu()
 
