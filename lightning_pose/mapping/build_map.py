@@ -18,7 +18,7 @@ from lightning_pose.geometry.triangulation import (
     sum_by_track,
     widest_angles_deg,
 )
-from lightning_pose.mapping.bundle_adjustment import Adjustment, adjust_bundle, measure_pose_sd
+from lightning_pose.mapping.bundle_adjustment import Adjustment, adjust_bundle
 from lightning_pose.mapping.camera_correction import CameraCorrection
 from lightning_pose.mapping.depth_vote import vote_depths
 from lightning_pose.mapping.frames import MapFrames, find_turn_rates
@@ -154,8 +154,7 @@ def adjust_mapped(mapped: MappedFrames) -> MappedFrames:
     state = Adjustment(given.rotation, given.position, tracks.points)
     for again in range(ADJUSTMENTS):
         if again:
-            sd = measure_pose_sd(state, given, tracks.track, tracks.frame, tracks.keypoint)
-            state, tracks = replace(state, pose_sd=sd), triangulate_tracks(seen, find_tracks(seen))
+            tracks = triangulate_tracks(seen, find_tracks(seen))
         state, seen, tracks = _adjust_once(state, given, tracks)
     return MappedFrames(given, seen, triangulate_tracks(seen, tracks), state)
 

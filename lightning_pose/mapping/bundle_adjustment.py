@@ -16,13 +16,13 @@ from lightning_pose.mapping.frames import MapFrames, find_turn_rates
 from lightning_pose.mapping.normal_equations import NormalEquations, Unknowns
 from lightning_pose.mapping.observations import Cameras, Observations
 
-__all__ = ["POSE_SD", "Adjustment", "adjust_bundle", "measure_pose_sd"]
+__all__ = ["Adjustment", "adjust_bundle"]
 
 CAUCHY_PX = 2.0
 """Scale of Cauchy's weights on image errors, which is also the errors' standard deviation."""
 
 POSE_SD = (0.005, 0.005)
-"""Standard deviations of the given poses before they are measured: radians, and a share of the median depth."""
+"""Standard deviations of the given poses: radians, and a share of the median depth."""
 
 OFFSET_SD = (0.005, 0.005)
 """Of the constant transform from the given pose to the camera: radians, and a share of the median depth."""
@@ -52,7 +52,6 @@ class Adjustment:
         camera: what is wrong with the assumed camera.
         rolling: whether the rows of an image are taken one after the other, while the camera turns.
         readout: time that they take for one unit of normalised y, in intervals between frames; 0 if not `rolling`.
-        pose_sd: standard deviations of the given poses, as `POSE_SD`.
     """
 
     rotation: np.ndarray
@@ -63,7 +62,6 @@ class Adjustment:
     camera: CameraCorrection = field(default_factory=CameraCorrection)
     rolling: bool = False
     readout: float = 0.0
-    pose_sd: tuple[float, float] = POSE_SD
 
     @property
     def camera_poses(self) -> tuple[np.ndarray, np.ndarray]:
@@ -112,22 +110,6 @@ def adjust_bundle(
     return state
 
 
-def measure_pose_sd(
-    state: Adjustment, given: MapFrames, track: np.ndarray, frame: np.ndarray, keypoint: np.ndarray
-) -> tuple[float, float]:
-    """By how much an adjustment with the arguments of `adjust_bundle` has moved the poses, as `POSE_SD`, at most that.
-
-    Poses that the images hardly move are right in detail, and are held tighter from then on.
-    """
-    if not len(track):
-        return POSE_SD
-    problem = _Problem(state, given, track, frame, keypoint)
-    moved, _ = problem.prior_errors(state)
-    turn_sd, move_sd = (float(np.sqrt((part**2).mean())) for part in (moved[:, :3], moved[:, 3:] / problem.depth))
-    least = 1e-3 * POSE_SD[0], 1e-3 * POSE_SD[1]  # poses that nothing moves at all still may move
-    return float(np.clip(turn_sd, least[0], POSE_SD[0])), float(np.clip(move_sd, least[1], POSE_SD[1]))
-
-
 class _Problem:
     """What one bundle adjustment is about: observations and priors, its cost, and one step."""
 
@@ -144,8 +126,8 @@ class _Problem:
         )
         rotation, position = start.camera_poses
         axis, away = rotation[frame, :, 2], start.points[track] - position[frame]
-        depth = self.depth = float(np.median((axis * away).sum(axis=1)))
-        self.pose_sd = np.repeat([start.pose_sd[0], start.pose_sd[1] * depth], 3)
+        depth = float(np.median((axis * away).sum(axis=1)))
+        self.pose_sd = np.repeat([POSE_SD[0], POSE_SD[1] * depth], 3)
         focal_px = float(np.median(given.focal_px))
         self.shared_sd = np.array(
             [OFFSET_SD[0]] * 3

@@ -30,13 +30,11 @@ INLIER_PX = 3.0
 ACCEPT_INLIERS = 20
 """Guided matches within 3 px that an accepted pose needs. With 12, poses came through that were metres off."""
 
-ACCEPT_FEW = 12
-ACCEPT_SHARE, ACCEPT_SHARE_OF_FEW = 0.015, 0.04
-"""Share of the points in view that must be inliers: chance matches grow with them. So few are enough if more are."""
+ACCEPT_SHARE = 0.015
+"""Share of the points in view that must be inliers: chance matches grow with them. `SURE_INLIERS` are enough."""
 
 ACCEPT_SD = (0.03, 1.5)
-ACCEPT_SD_OF_FEW = (0.018, 1.0)
-"""Standard deviations that an accepted pose may have: in median depths, and degrees."""
+"""Standard deviations that an accepted pose of fewer may have: in median depths, and degrees."""
 
 PRIOR = (0.5, 30.0)
 """How far a pose may lie from a prior: in median depths of the map's points, and degrees."""
@@ -260,14 +258,13 @@ class MapLocalizer:
 
     def _judge(self, inliers: int, visible: int, position_sd: float, orientation_sd_deg: float) -> str:
         """Why a pose is refused; empty if it is accepted."""
-        few = inliers < ACCEPT_INLIERS
-        share = ACCEPT_SHARE_OF_FEW if few else ACCEPT_SHARE
-        if inliers < ACCEPT_FEW or (inliers < SURE_INLIERS and inliers < share * visible):
+        if inliers < ACCEPT_INLIERS or (inliers < SURE_INLIERS and inliers < ACCEPT_SHARE * visible):
             return f"too few guided inliers: {inliers} of {visible} points in view"
-        away, turned = position_sd / self._depth, orientation_sd_deg
-        most_away, most_turned = ACCEPT_SD_OF_FEW if few else ACCEPT_SD
-        if inliers < SURE_INLIERS and (away > most_away or turned > most_turned):
-            return f"weak geometry: standard deviations of {away:.2g} median depths and {turned:.2g} degrees"
+        away = position_sd / self._depth
+        if inliers < SURE_INLIERS and (away > ACCEPT_SD[0] or orientation_sd_deg > ACCEPT_SD[1]):
+            return (
+                f"weak geometry: standard deviations of {away:.2g} median depths and {orientation_sd_deg:.2g} degrees"
+            )
         return ""
 
     def _refuse(self, frame: int, reason: str, visible: int = 0) -> MapAnswer:

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lightning_pose.geometry.rolling_shutter import remove_rolling
-from lightning_pose.mapping.bundle_adjustment import POSE_SD, Adjustment, adjust_bundle, measure_pose_sd
+from lightning_pose.mapping.bundle_adjustment import Adjustment, adjust_bundle
 from lightning_pose.mapping.camera_correction import CameraCorrection
 from lightning_pose.mapping.depth_vote import vote_depths
 from lightning_pose.mapping.frames import find_distance_scale, find_turn_rates
@@ -148,10 +148,6 @@ def test_bundle_adjustment_finds_perturbed_poses_and_the_camera() -> None:
     assert np.median(error) < 0.05, "images agree to a twentieth of a pixel"
     # All cameras may turn by a common angle, which the principal point makes up for: compare frames with each other.
     assert _median_turn(rotation, camera_rotation) < 0.2 * _median_turn(rotation, given.rotation)
-    turn_sd, move_sd = measure_pose_sd(found, given, track, frame, track)
-    assert 0.002 < turn_sd <= POSE_SD[0], "the given poses were off by 0.004 radians"
-    assert 0.001 < move_sd < POSE_SD[1], "and by 0.01 of a depth of some 3.3"
-    assert measure_pose_sd(replace(found, rotation=given.rotation), given, track, frame, track)[0] < 1e-5
 
 
 def test_bundle_adjustment_finds_the_readout_of_a_rolling_shutter() -> None:
