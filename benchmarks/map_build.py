@@ -77,7 +77,7 @@ def build(every: MapFrames, is_val: np.ndarray) -> tuple[MapLocalizer, str]:
     if after < before:
         back = MapLocalizer(summarize_tracks(adjusted))
         poses = [
-            answer.pose_in_map if answer.accepted else back.carry_forward(CameraPose(rotation, position))
+            answer.pose_in_map if answer.accepted else back.given_poses.carry_forward(CameraPose(rotation, position))
             for answer, rotation, position in zip(found[1], val.rotation, val.position, strict=True)
         ]
         rows = np.flatnonzero(~is_val)

@@ -26,8 +26,8 @@ from scipy.sparse.csgraph import connected_components
 from lightning_pose.geometry.absolute_pose import CameraPose
 from lightning_pose.mapping import build_map, bundle_adjustment, guided_matching, map_localizer, pairs, query_matching
 from lightning_pose.mapping.frames import MapFrames, MapQuery
+from lightning_pose.mapping.given_poses import GivenPoses
 from lightning_pose.mapping.guided_matching import KeypointMatches
-from lightning_pose.mapping.map_localizer import MapLocalizer
 from lightning_pose.mapping.query_matching import QueryMatcher
 
 Patches = list[AbstractContextManager]
@@ -121,7 +121,7 @@ def list_query_steps() -> dict[str, Callable[[], Patches]]:
     """What to replace while images are located, by the step that is left out."""
     query = query_matching
     return {
-        "carrying back": lambda: replace_all(MapLocalizer, carry_back=lambda self, pose, *turn: pose),
+        "carrying back": lambda: replace_all(GivenPoses, carry_back=lambda self, pose, *turn: pose),
         "candidates (the whole map)": lambda: replace_all(query, CANDIDATES=10**6),
         "ratio tests of queries": lambda: replace_all(query, MATCH_RATIO=1.0, GUIDED_RATIO=1.0),
         "size check of queries": lambda: replace_all(query, SIZE_OCTAVES=99.0),

@@ -69,7 +69,7 @@ def _place_frames(old: PointMap, frames: MapFrames) -> MapFrames:
     """The frames with the poses and keypoints of the map's own cameras."""
     localizer = MapLocalizer(old)
     poses = [
-        answer.pose_in_map if answer.accepted else localizer.carry_forward(CameraPose(rotation, position))
+        answer.pose_in_map if answer.accepted else localizer.given_poses.carry_forward(CameraPose(rotation, position))
         for answer, rotation, position in zip(
             locate_frames(localizer, frames), frames.rotation, frames.position, strict=True
         )

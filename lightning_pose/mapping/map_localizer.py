@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from lightning_pose.geometry.absolute_pose import CameraPose, find_pose_ransac, refine_pose
 from lightning_pose.geometry.rolling_shutter import TurningPose, refine_turning_pose, remove_rolling
 from lightning_pose.mapping.frames import MapQuery
+from lightning_pose.mapping.given_poses import GivenPoses
 from lightning_pose.mapping.point_map import PointMap
 from lightning_pose.mapping.query_matching import QueryMatcher
 
@@ -45,12 +46,6 @@ PRIOR_PX = 64.0
 SURE_INLIERS = 40
 MOST_PASSES = 3
 """Guided passes; after each, fewer inliers than that are matched anew from the better pose."""
-
-KERNEL = (0.05, 5.0)
-"""How far training frames lend their offset to an answer: in median depths of the map's points, and degrees."""
-
-AROUND = 15
-"""Frames before and after each over which the drift of the given poses hardly changes, while the camera's turn does."""
 
 
 class ShownPoints(NamedTuple):
@@ -112,33 +107,18 @@ class MapLocalizer:
     Args:
         point_map: the map; at least one training frame.
         without: numbers of training frames that answers may not use, as if they had not been in the training.
+
+    Attributes:
+        given_poses: carries poses from the map to those of the dataset, and back.
     """
 
     def __init__(self, point_map: PointMap, without: np.ndarray | None = None) -> None:
         self.map = point_map
         self._matcher = QueryMatcher(point_map)
         self._camera = point_map.camera_correction
-        kept = np.ones(len(point_map.position), bool)
-        if without is not None:
-            kept[without] = False
-        self._kept = np.flatnonzero(kept)
-        back = np.swapaxes(point_map.rotation, 1, 2)[self._kept]
-        self._turn_back = Rotation.from_matrix(back @ point_map.given_rotation[self._kept]).as_rotvec()
-        moved = point_map.given_position[self._kept] - point_map.position[self._kept]
-        self._move_back = np.einsum("fij,fj->fi", back, moved)
-        self._adjusted = bool(np.abs(self._turn_back).max() > 1e-12 or np.abs(self._move_back).max() > 1e-12)
-        turns = point_map.turns[self._kept]
-        self._turn_sd = float(np.sqrt((turns**2).mean()))
-        self._by_turn = np.zeros((3, 6))
-        if self._turn_sd > 0:
-            moved_back = np.concatenate([self._turn_back, self._move_back], axis=1)
-            self._by_turn = np.linalg.lstsq(_subtract_mean(turns), _subtract_mean(moved_back), rcond=None)[0]
-            self._turn_back = self._turn_back - turns @ self._by_turn[:, :3]
-            self._move_back = self._move_back - turns @ self._by_turn[:, 3:]
-        frame, point = point_map.seen_frame, point_map.seen_point
-        distance = np.linalg.norm(point_map.points[point] - point_map.position[frame], axis=1)
-        self._depth = float(np.median(distance)) if len(distance) else 1.0
-        self._kernel = KERNEL[0] * self._depth
+        self.given_poses = GivenPoses(point_map, without)
+        self._first = int(self.given_poses.kept[0])
+        self._turn_sd, self._depth = self.given_poses.turn_sd, point_map.measure_depth()
         self._covariance = point_map.measure_covariances()
 
     def locate(self, query: MapQuery, prior: CameraPose | None = None) -> MapAnswer:
@@ -154,7 +134,7 @@ class MapLocalizer:
         found = self._search(query, points)
         if prior is None:
             return found
-        near = self.carry_forward(prior)
+        near = self.given_poses.carry_forward(prior)
         away, turned = self._measure_distance(found.pose_in_map, near)
         if found.accepted and away <= PRIOR[0] and turned <= PRIOR[1]:
             return found
@@ -245,7 +225,7 @@ class MapLocalizer:
         position_sd, turn_sd_deg = float(np.sqrt(spread[3:].sum())), float(np.degrees(np.sqrt(spread[:3].sum())))
         reason = self._judge(inliers, visible, position_sd, turn_sd_deg)
         return MapAnswer(
-            self.carry_back(refined.pose, refined.turn),
+            self.given_poses.carry_back(refined.pose, refined.turn),
             refined.pose,
             inliers,
             visible,
@@ -268,47 +248,6 @@ class MapLocalizer:
         return ""
 
     def _refuse(self, frame: int, reason: str, visible: int = 0) -> MapAnswer:
-        frame = int(self._kept[0]) if frame < 0 else frame
+        frame = self._first if frame < 0 else frame
         given = CameraPose(self.map.given_rotation[frame], self.map.given_position[frame])
         return MapAnswer(given, CameraPose(self.map.rotation[frame], self.map.position[frame]), 0, visible, reason)
-
-    def carry_back(self, pose: CameraPose, turn: np.ndarray | None = None) -> CameraPose:
-        """The pose that the dataset would give a camera at `pose` of the map: by what near training frames were moved.
-
-        The offset of an answer is the mean of theirs, in the axes of the camera, weighted by a Gaussian of their
-        distance and angle to it. What depends on how the camera `turn`ed (3,), because the clocks of images and poses
-        differ or because the given poses take the shutter for a global one, is a linear function of it.
-        """
-        if not self._adjusted:
-            return pose
-        offset = self._mean_offset(pose, self.map.rotation, self.map.position)
-        if turn is not None:
-            offset = offset + turn @ self._by_turn
-        back = Rotation.from_rotvec(offset[:3]).as_matrix()
-        return CameraPose(pose.rotation @ back, pose.position + pose.rotation @ offset[3:])
-
-    def carry_forward(self, pose: CameraPose) -> CameraPose:
-        """Where the map would put a camera at a pose that the dataset gives: the other way round."""
-        if not self._adjusted:
-            return pose
-        offset = self._mean_offset(pose, self.map.given_rotation, self.map.given_position)
-        rotation = pose.rotation @ Rotation.from_rotvec(-offset[:3]).as_matrix()
-        return CameraPose(rotation, pose.position - rotation @ offset[3:])
-
-    def _mean_offset(self, pose: CameraPose, rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
-        """(6,) rotation vector and movement, in a camera's axes, from the map to given poses, of near frames."""
-        away = np.linalg.norm(position[self._kept] - pose.position, axis=1) / self._kernel
-        cosine = (np.einsum("fij,ij->f", rotation[self._kept], pose.rotation) - 1) / 2
-        turned = np.degrees(np.arccos(np.clip(cosine, -1, 1))) / KERNEL[1]
-        squared = away**2 + turned**2
-        weight = np.exp(-0.5 * (squared - squared.min()))
-        weight /= weight.sum()
-        return np.concatenate([weight @ self._turn_back, weight @ self._move_back])
-
-
-def _subtract_mean(values: np.ndarray) -> np.ndarray:
-    """(F, K) less their mean over the frames around each: what drifts slowly is gone."""
-    total = np.cumsum(np.pad(values, ((1, 0), (0, 0))), axis=0)
-    frame = np.arange(len(values))
-    first, last = np.maximum(frame - AROUND, 0), np.minimum(frame + AROUND + 1, len(values))
-    return values - (total[last] - total[first]) / (last - first)[:, None]

@@ -74,6 +74,11 @@ class PointMap:
         """(O,) int64, the frame of each observation."""
         return np.repeat(np.arange(len(self.seen_count)), self.seen_count)
 
+    def measure_depth(self) -> float:
+        """Median distance of the points from the frames that saw them; 1 for an empty map."""
+        distance = np.linalg.norm(self.points[self.seen_point] - self.position[self.seen_frame], axis=1)
+        return float(np.median(distance)) if len(distance) else 1.0
+
     def measure_covariances(self) -> np.ndarray:
         """(P, 3, 3) covariances of the points, if the frames that saw them err by 1 in normalised coordinates."""
         point, n = self.seen_point.astype(np.int64), len(self)

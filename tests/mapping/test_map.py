@@ -13,6 +13,7 @@ from lightning_pose.geometry.absolute_pose import CameraPose
 from lightning_pose.mapping.build_map import add_frames, build_point_map, map_frames, summarize_tracks
 from lightning_pose.mapping.calibration import calibrate_map, measure_frames
 from lightning_pose.mapping.frames import MapFrames, MapQuery
+from lightning_pose.mapping.given_poses import GivenPoses
 from lightning_pose.mapping.map_localizer import MapLocalizer
 from tests.mapping.helpers import make_frames, make_walk
 
@@ -193,10 +194,10 @@ def test_carrying_back_returns_what_the_dataset_gives(training: MapFrames) -> No
         given_position=point_map.position + point_map.rotation @ [0.01, 0.0, 0.03],
     )
     pose = CameraPose(point_map.rotation[20], point_map.position[20])
-    carried = MapLocalizer(shifted).carry_back(pose)
+    carried = GivenPoses(shifted).carry_back(pose)
     np.testing.assert_allclose(carried.rotation, shifted.given_rotation[20], atol=1e-9)
     np.testing.assert_allclose(carried.position, shifted.given_position[20], atol=1e-9)
-    there = MapLocalizer(shifted).carry_forward(carried)
+    there = GivenPoses(shifted).carry_forward(carried)
     np.testing.assert_allclose(there.rotation, pose.rotation, atol=1e-9)
     np.testing.assert_allclose(there.position, pose.position, atol=1e-9)
 
@@ -206,8 +207,8 @@ def test_an_offset_of_the_clocks_is_carried_back_by_how_the_camera_turns(trainin
     turns = point_map.turns
     late = replace(point_map, given_rotation=point_map.rotation @ Rotation.from_rotvec(0.4 * turns).as_matrix())
     pose, turn = CameraPose(point_map.rotation[20], point_map.position[20]), np.array([0.02, -0.03, 0.01])
-    carried = MapLocalizer(late).carry_back(pose, turn)
-    still = MapLocalizer(late).carry_back(pose)
+    carried = GivenPoses(late).carry_back(pose, turn)
+    still = GivenPoses(late).carry_back(pose)
     np.testing.assert_allclose(
         Rotation.from_matrix(still.rotation.T @ carried.rotation).as_rotvec(), 0.4 * turn, atol=1e-3
     )

@@ -142,7 +142,9 @@ class MapBuilder:
         localizer = MapLocalizer(summarize_tracks(mapped))
         answers = self._val_answers or locate_frames(localizer, val)
         poses = [
-            answer.pose_in_map if answer.accepted else localizer.carry_forward(CameraPose(rotation, position))
+            answer.pose_in_map
+            if answer.accepted
+            else localizer.given_poses.carry_forward(CameraPose(rotation, position))
             for answer, rotation, position in zip(answers, val.rotation, val.position, strict=True)
         ]
         return add_frames(mapped, every, rows, poses)
