@@ -71,7 +71,7 @@ def main() -> None:
     parser.add_argument("--nodes", type=int, nargs="+", default=[1000, 10_000, 100_000, 1_000_000])
     parser.add_argument("--features", type=int, default=64)
     parser.add_argument("--epochs", type=int, default=2)
-    parser.add_argument("--full_graph_limit", type=int, default=2_000)
+    parser.add_argument("--full_graph_limit", type=int, default=10_000)
     parser.add_argument("--one", action="store_true", help="measure in this process, and print JSON")
     args = parser.parse_args()
     if args.one:

@@ -127,7 +127,7 @@ class PoseModule(RefinedModule, StandardizedModule):
         self.standardize_features = standardize_features
         self.loss = PoseLoss(loss)
         self.world_frame = WorldFrame(centred=not self.reads_clips)
-        self.divergence = DivergenceWatch()
+        self.divergence = DivergenceWatch(self._name_frame)
         self.val_metrics, self.val_losses = PoseMetrics(), ItemMeans()
         self.test_metrics, self.test_losses = PoseMetrics(), ItemMeans()
         self.register_scales()
@@ -196,12 +196,16 @@ class PoseModule(RefinedModule, StandardizedModule):
             self.fit_world_frame(train)
             position_m, quat_wxyz = self.training_poses(train)
             position = self.world_frame.to_local(position_m)
-            self.divergence.names = [f"{frame.sequence}/{frame.image.name}" for frame in datamodule.scene.frames]
             self.divergence.spread_m = float((position - position.mean(0)).norm(dim=-1).mean())
             self.fit_scale(position.to(self.pose_mean), quat_wxyz.to(self.quat_reference))
             self.fit_feature_scale(train.data.features)
             if self.radius is not None:
                 self.radius.set_training(train.data.features)
+
+    def _name_frame(self, number: int) -> str:
+        """The sequence and the file of a frame of the scene."""
+        frame = scene_datamodule(self.trainer).scene.frames[number]
+        return f"{frame.sequence}/{frame.image.name}"
 
     def fit_world_frame(self, train: PoseDataset) -> None:
         """Choose the origin and the scale of the positions of the training split."""

@@ -82,7 +82,7 @@ class NodePose(TrainingMemory, PoseModule):
         neighbour_poses: int = 1,
         slope: float = 0.5,
         gap: int = 1,
-        full_graph_limit: int = 2_000,
+        full_graph_limit: int = 10_000,
         fanout: int = 10,
         **kwargs: Any,
     ) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable
 
 import torch
 from torch import Tensor
@@ -33,12 +33,14 @@ class DivergenceWatch:
 
     Attributes:
         spread_m: mean distance of the training positions from their mean; 0 for one position, which sets no bound.
-        names: of the scene's frames, for messages; their numbers stand in for missing ones.
+
+    Args:
+        name_frame: a frame's index in the scene to its name, for messages.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, name_frame: Callable[[int], str] = str) -> None:
         self.spread_m = 0.0
-        self.names: Sequence[str] = ()
+        self._name_frame = name_frame
         self._first: Tensor | None = None
         self._steps: list[Tensor] = []  # loss and position error
         self._frames: list[Tensor] = []
@@ -103,9 +105,6 @@ class DivergenceWatch:
                 f"{remedy}"
             )
         self._done += [(loss, error) for loss, error in values]
-
-    def _name_frame(self, frame: int) -> str:
-        return self.names[frame] if frame < len(self.names) else str(frame)
 
     def describe_growth(self) -> str | None:
         """What is wrong with a training that has ended farther off than it began; None if nothing is."""

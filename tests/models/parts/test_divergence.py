@@ -41,8 +41,7 @@ def test_a_loss_that_is_no_number(loss: float) -> None:
 def test_the_batch_and_its_frames_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     """Also before the end of a long epoch."""
     monkeypatch.setattr(divergence, "MOST_STEPS", 4)
-    watch = DivergenceWatch()
-    watch.names = [f"seq-01/{number}.png" for number in range(6)]
+    watch = DivergenceWatch("seq-01/{}.png".format)
     losses = [torch.tensor(value) for value in (1.0, 1.0, 1.0, 1.0, 1.0, torch.nan, torch.nan)]
     for loss in losses:
         watch.add_step(loss, torch.zeros(5, 3), torch.zeros(5, 3), torch.tensor([5, 3, 2, 1, 9]), "lower it")
