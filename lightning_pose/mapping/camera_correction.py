@@ -1,4 +1,4 @@
-"""CameraCorrection: small errors of the camera that a map was told."""
+"""CameraCorrection: small errors of the camera that is given for a map."""
 
 from __future__ import annotations
 
