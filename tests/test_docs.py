@@ -28,7 +28,7 @@ PAGES = sorted([*REPOSITORY.glob("*.md"), *(REPOSITORY / "docs").glob("*.md")])
 PROGRAM = "python -m lightning_pose "
 SHELL = ("uv", "python", "mlflow", "bash", "docker", "curl", "pip")
 DATED = re.compile(r"\b[Rr]un on 20\d\d-\d\d-\d\d|has not been built yet")
-CHECKPOINT = REPOSITORY / "tests" / "checkpoints" / "surf_lstm_0_1.ckpt"
+CHECKPOINT = REPOSITORY / "tests" / "checkpoint" / "files" / "surf_lstm_0_1.ckpt"
 SYSTEMS = ("linear_posenet", "surf_lstm", "cnn_rnn")
 
 SMALL = "--trainer.accelerator cpu --report.log_model false"

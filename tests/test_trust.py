@@ -20,7 +20,7 @@ from lightning_pose.localization.localizer import Localizer
 from lightning_pose.localization.trained_system import TrainedSystem
 from tests.helpers import Trained
 
-CHECKPOINT = Path(__file__).parent / "checkpoints" / "surf_lstm_0_1.ckpt"
+CHECKPOINT = Path(__file__).parent / "checkpoint" / "files" / "surf_lstm_0_1.ckpt"
 EVIL = """
 from pathlib import Path
 from lightning_pose.models import SurfLSTM

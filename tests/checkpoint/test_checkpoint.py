@@ -44,7 +44,7 @@ def test_what_cannot_be_rebuilt_is_refused(path: str, init_args: dict[str, Any],
         build_object({"class_path": path, "init_args": init_args}, allow=["nowhere", "tests", "Thing"])
 
 
-CHECKPOINTS = Path(__file__).parent / "checkpoints"
+CHECKPOINTS = Path(__file__).parent / "files"
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,6 @@
-"""Checkpoint files, and the objects in them as plain specs (class path and arguments).
+"""Objects in checkpoints as plain specs: a class path and arguments.
 
 A spec is what config files write: `describe_object` makes it from an object, `build_object` the object from it.
-`read_checkpoint` reads a file that `fit` wrote; class paths of older versions are replaced by today's.
 
 A checkpoint may come from a stranger, so that no class in it is imported unless this package has it, as an
 architecture, a feature extractor or a data module, or the user allows it by name.
@@ -12,84 +11,21 @@ from __future__ import annotations
 import inspect
 import re
 import sys
-import zipfile
 from collections.abc import Iterable, Mapping
 from importlib import import_module
-from pathlib import Path
 from typing import Any
 
-import torch
-
+from lightning_pose.checkpoint.class_paths import resolve_class_path
+from lightning_pose.checkpoint.setting_types import find_mistyped
 from lightning_pose.errors import CheckpointError, PoseError
-from lightning_pose.setting_types import find_mistyped
 
-__all__ = [
-    "RENAMED_CLASSES",
-    "Spec",
-    "build_object",
-    "check_file",
-    "check_specs",
-    "class_path",
-    "describe_object",
-    "find_class_paths",
-    "read_checkpoint",
-    "resolve_class_path",
-    "resolve_class_paths",
-]
+__all__ = ["Spec", "build_object", "check_specs", "class_path", "describe_object", "find_class_paths"]
 
 Spec = dict[str, Any]
 """`{"class_path": "package.module.Class", "init_args": {...}}`, plain types only."""
 
-_MODELS = {
-    "cnn_3d": "CNN3D",
-    "cnn_rnn": "CNNRNN",
-    "dense_posenet": "DensePoseNet",
-    "graph_pose": "GraphPose",
-    "kernel_posenet": "KernelPoseNet",
-    "linear_posenet": "LinearPoseNet",
-    "node_pose": "NodePose",
-    "posenet": "PoseNet",
-    "surf_cnn": "SurfCNN",
-    "surf_lstm": "SurfLSTM",
-}
-
-RENAMED_CLASSES = {
-    **{f"lightning_pose.models.{module}.{name}": f"lightning_pose.models.{name}" for module, name in _MODELS.items()},
-    "lightning_pose.features.classical.BRIEF": "lightning_pose.features.BRIEF",
-    "lightning_pose.features.classical.FREAK": "lightning_pose.features.FREAK",
-    "lightning_pose.features.classical.ORB": "lightning_pose.features.ORB",
-    "lightning_pose.features.classical.SIFT": "lightning_pose.features.SIFT",
-    "lightning_pose.features.cnn.CNN": "lightning_pose.features.CNN",
-    "lightning_pose.features.pixels.Pixels": "lightning_pose.features.Pixels",
-    "lightning_pose.features.surf.SURF": "lightning_pose.features.SURF",
-    "lightning_pose.data.datamodules.ImageDataModule": "lightning_pose.data.ImageDataModule",
-    "lightning_pose.data.datamodules.ClipDataModule": "lightning_pose.data.ClipDataModule",
-    "lightning_pose.data.datamodules.images.ImageDataModule": "lightning_pose.data.ImageDataModule",
-    "lightning_pose.data.datamodules.clips.ClipDataModule": "lightning_pose.data.ClipDataModule",
-    "lightning_pose.tracking.MLflowLogger": "lightning_pose.runs.logger.MLflowLogger",
-}
-"""Class paths in older checkpoints and configs, to today's. A path that is listed here must never name a new class."""
-
-
 MOVED_SETTINGS = {("lightning_pose.models.LandmarkMap", "camera"): "camera"}
 """Settings of a model, by its class and name, that are settings of the data now, to their name there."""
-
-
-def resolve_class_path(path: str) -> str:
-    """Today's class path for one in an older file; the path itself if it was never renamed."""
-    return RENAMED_CLASSES.get(path, path)
-
-
-def resolve_class_paths(config: object) -> object:
-    """Copy a config's or a spec's nested values, with each class path replaced by today's.
-
-    Configs name a class by `class_path` or by a bare string, as in `extractor: lightning_pose.features.SURF`.
-    """
-    if isinstance(config, Mapping):
-        return {key: resolve_class_paths(value) for key, value in config.items()}
-    if isinstance(config, list):
-        return [resolve_class_paths(value) for value in config]
-    return resolve_class_path(config) if isinstance(config, str) else config
 
 
 def class_path(obj: object) -> str:
@@ -278,47 +214,3 @@ def _import_class(path: str, packages: Iterable[str]) -> type:
     if not isinstance(found, type) or not issubclass(found, bases):
         raise CheckpointError(f"{path} is no {' or '.join(base.__name__ for base in bases)}, as `fit` would name it")
     return found
-
-
-def read_checkpoint(path: str | Path) -> dict[str, Any]:
-    """Read a checkpoint that `fit` wrote: tensors are memory-mapped on the CPU, class paths are today's.
-
-    Classes that it names are not imported: `check_specs` decides which of them may be.
-
-    Raises:
-        CheckpointError: the file is missing, unreadable, damaged, or was not written by this project.
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise CheckpointError(f"{path} is no file; give a checkpoint such as mlruns/checkpoints/RUN_ID/best.ckpt")
-    check_file(path)
-    try:
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except Exception as error:  # torch raises many kinds of exception for a file that is no checkpoint
-        raise CheckpointError(
-            f"{path} cannot be read as a checkpoint; it is damaged or another kind of file"
-        ) from error
-    if not isinstance(checkpoint, dict) or not {"lightning_pose", "state_dict"} <= checkpoint.keys():
-        raise CheckpointError(f"{path} was not written by lightning_pose; give a checkpoint that `fit` wrote")
-    return checkpoint | {"lightning_pose": resolve_class_paths(checkpoint["lightning_pose"])}
-
-
-def check_file(path: Path) -> None:
-    """Compare a checkpoint's content with its checksums: `torch.save` writes a zip archive, with a CRC-32 an entry.
-
-    Torch does not check them when it reads the file.
-
-    Raises:
-        CheckpointError: they differ, or the file is no such archive.
-    """
-    try:
-        with zipfile.ZipFile(path) as archive:
-            damaged = archive.testzip()
-    except Exception as error:  # a damaged archive ends in many kinds of exception
-        raise CheckpointError(
-            f"{path} cannot be read as a checkpoint; it is damaged or another kind of file"
-        ) from error
-    if damaged is not None:
-        raise CheckpointError(
-            f"{path} is damaged (the checksum of {damaged} differs); copy it again, or train it again"
-        )
