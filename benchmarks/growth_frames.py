@@ -16,8 +16,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -27,7 +25,7 @@ import psutil
 import torch
 from lightning import Trainer
 
-from benchmarks.made_frames import MadeFrames, MadeVectors, fit_exponent, peak_rss_gb
+from benchmarks.made_frames import MadeFrames, MadeVectors, ask_process, fit_exponent, peak_rss_gb
 from lightning_pose import models
 from lightning_pose.features import SURF
 
@@ -89,11 +87,9 @@ def main() -> None:
     for name in args.models:
         rows = []
         for frames in args.frames:
-            words = ["--one", "--models", name, "--frames", frames, "--units", args.units]
+            words = ["--models", name, "--frames", frames, "--units", args.units]
             words += ["--folder", args.folder] if args.folder else []
-            command = [sys.executable, "-m", "benchmarks.growth_frames", *map(str, words)]
-            done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
-            row = json.loads(done.stdout.splitlines()[-1])
+            row = ask_process("benchmarks.growth_frames", *words)
             rows.append(row)
             print(
                 f"{name:14s} {frames:8,d}  {row['GiB']:12.2f}  {row['seconds']:5.0f}  {row['own']:7.2f}"

@@ -12,8 +12,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -22,7 +20,7 @@ import torch
 from lightning import Trainer
 from torch.nn import functional as F
 
-from benchmarks.made_frames import EpochClock, MadeFrames, MadeVectors, fit_exponent, peak_rss_gb
+from benchmarks.made_frames import EpochClock, MadeFrames, MadeVectors, ask_process, fit_exponent, peak_rss_gb
 from lightning_pose.data.batches import PoseBatch
 from lightning_pose.models import NodePose
 from lightning_pose.models.parts.neighbour_graph import search_neighbours
@@ -81,9 +79,7 @@ def main() -> None:
     rows = []
     for nodes in args.nodes:
         words = ["--features", args.features, "--epochs", args.epochs, "--full_graph_limit", args.full_graph_limit]
-        command = [sys.executable, "-m", "benchmarks.growth_nodes", "--one", "--nodes", str(nodes), *map(str, words)]
-        done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
-        row = json.loads(done.stdout.splitlines()[-1])
+        row = ask_process("benchmarks.growth_nodes", "--nodes", nodes, *words)
         rows.append(row)
         print(
             f"{nodes:9,d}  {row['search']:8.1f}  {row['recall']:.3f}  {row['epoch']:7.2f}  {row['all']:5.0f}"

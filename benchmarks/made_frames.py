@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import math
 import resource
+import subprocess
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,7 +24,7 @@ from lightning_pose.features.array_files import allocate_rows
 from lightning_pose.features.base import FeatureExtractor, Record
 from lightning_pose.scenes.scene import Scene
 
-__all__ = ["EpochClock", "MadeFrames", "MadeVectors", "fit_exponent", "peak_rss_gb"]
+__all__ = ["EpochClock", "MadeFrames", "MadeVectors", "ask_process", "fit_exponent", "peak_rss_gb"]
 
 PER_M2 = 400
 """Frames a square metre, whatever their number."""
@@ -127,3 +131,10 @@ def peak_rss_gb() -> float:
 def fit_exponent(counts: list[int], values: list[float]) -> float:
     """The exponent of values that grow as a power of counts, by least squares of logarithms."""
     return float(np.polyfit(np.log(counts), np.log(values), 1)[0])
+
+
+def ask_process(module: str, *words: object) -> dict[str, Any]:
+    """What `python -m MODULE --one WORDS` prints as JSON, in its last line: a process with its own peak memory."""
+    command = [sys.executable, "-m", module, "--one", *map(str, words)]
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+    return json.loads(done.stdout.splitlines()[-1])
