@@ -15,7 +15,7 @@ from lightning_pose.serving.load_service import load_service
 from tests.fuzz.datasets import WORDS, Damage, apply_damages, damages
 from tests.serving.helpers import Server, encode_picture, make_form, serve
 
-CHECKPOINT = Path(__file__).parents[1] / "checkpoints" / "surf_lstm_0_1.ckpt"
+CHECKPOINT = Path(__file__).parents[1] / "checkpoint" / "files" / "surf_lstm_0_1.ckpt"
 FORM, FORM_TYPE = make_form(encode_picture(), camera="PINHOLE,64,48,60,60,31.5,23.5", prior="0 0 0 1 0 0 0")
 BODIES = [(encode_picture(".jpg"), "application/octet-stream"), (encode_picture(), "image/png"), (FORM, FORM_TYPE)]
 PATHS = [

@@ -22,7 +22,7 @@ from tests.fuzz.datasets import Damage, apply_damages, damages
 from tests.fuzz.nested import Change, apply_changes, changes
 from tests.helpers import Workplace
 
-CHECKPOINT = Path(__file__).parents[1] / "checkpoints" / "surf_lstm_0_1.ckpt"
+CHECKPOINT = Path(__file__).parents[1] / "checkpoint" / "files" / "surf_lstm_0_1.ckpt"
 
 SWEEP = {
     "objective": ["val/position_median_m", "cost/parameters"],
