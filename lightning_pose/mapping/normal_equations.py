@@ -51,12 +51,14 @@ class Unknowns(NamedTuple):
 class _Part(NamedTuple):
     """Sums of the products of some observations' derivatives; the points' are whitened.
 
-    `frames` is (21 + 36, F): products of `y` with itself, above its diagonal, and with the numbers and the error.
+    `frames` is (21 + 36, K), of the K frames `present`: products of `y` with itself, above its diagonal, and with the
+    numbers and the error.
     `shared` is (6, 6): of the numbers and the error. `whiten` is (T, 3, 3), which turns a point's block of the normal
     equations into the identity. `blocks` (O, 6, 3) are products of `y` with points, `points` (T, 3, 6) those of points
     with the numbers and the error.
     """
 
+    present: np.ndarray
     frames: np.ndarray
     shared: np.ndarray
     whiten: np.ndarray
@@ -64,10 +66,11 @@ class _Part(NamedTuple):
     points: np.ndarray
 
 
-def _add_up(view: View, n_frames: int, n_points: int, damping: float) -> _Part:
+def _add_up(view: View, n_points: int, damping: float) -> _Part:
     """The sums of one part. A point moves as `y` does, the other way."""
     by_u, by_v = view.derive()
-    frame, track = view.seen.frame, view.seen.track
+    track = view.seen.track
+    present, frame = np.unique(view.seen.frame, return_inverse=True)
     own = [by_u[i] * by_u[j] + by_v[i] * by_v[j] for i, j in PAIRS]
     others = [by_u[i] * by_u[6:] + by_v[i] * by_v[6:] for i in range(6)]
     number = {pair: at for at, pair in enumerate(PAIRS)}
@@ -85,8 +88,8 @@ def _add_up(view: View, n_frames: int, n_points: int, damping: float) -> _Part:
         blocks[:, i, 0] = -lower[0] * x
         blocks[:, i, 1] = -lower[3] * x - lower[4] * y
         blocks[:, i, 2] = -lower[6] * x - lower[7] * y - lower[8] * z
-    frames = _sum_rows(frame, [*own, *(row for rows in others for row in rows)], n_frames)
-    return _Part(frames, by_u[6:] @ by_u[6:].T + by_v[6:] @ by_v[6:].T, whiten, blocks, whiten @ of_both)
+    frames = _sum_rows(frame, [*own, *(row for rows in others for row in rows)], len(present))
+    return _Part(present, frames, by_u[6:] @ by_u[6:].T + by_v[6:] @ by_v[6:].T, whiten, blocks, whiten @ of_both)
 
 
 class NormalEquations:
@@ -103,10 +106,12 @@ class NormalEquations:
         n = len(cameras.position)
 
         def add_up(ends: tuple[int, int]) -> _Part:
-            return _add_up(View(seen.part(*ends), cameras, points[slice(*ends)]), n, ends[1] - ends[0], damping)
+            return _add_up(View(seen.part(*ends), cameras, points[slice(*ends)]), ends[1] - ends[0], damping)
 
         parts = map_in_threads(add_up, seen.ends())
-        frames = np.sum([part.frames for part in parts], axis=0)
+        frames = np.zeros((len(PAIRS) + 36, n))
+        for part in parts:
+            frames[:, part.present] += part.frames
         shared = np.sum([part.shared for part in parts], axis=0)
         own, other = np.triu_indices(6)
         self.of_y = np.empty((n, 6, 6))

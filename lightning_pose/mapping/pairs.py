@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from itertools import pairwise, repeat
+
 import numpy as np
+from scipy import sparse
+from scipy.spatial import cKDTree
 
 from lightning_pose.mapping.frames import MapFrames
 
@@ -22,6 +27,12 @@ PARTNERS_OF_FEW = 20
 
 FEW_FRAMES = 200
 
+MOST_COMPARED = 1000
+"""Up to so many frames, all are compared with each other; of more, each with so many that look at places near its own."""
+
+GROUPS, GROUP = 50, 200
+"""Where there are more, this many groups of so many frames near each other say how far away things are."""
+
 GRID = (7, 5)
 """Points across and down an image that stand for what it sees."""
 
@@ -30,7 +41,8 @@ def estimate_depth(rotation: np.ndarray, position: np.ndarray) -> float:
     """A typical distance from the cameras to what they see: to the point that is nearest to all optical axes.
 
     Needs no scale. Where the axes do not meet (a camera that looks outward as it goes), the point lies behind many
-    cameras, and the distance is of the order of the path's extent.
+    cameras, and the distance is of the order of the path's extent. More than `MOST_COMPARED` frames may be of many
+    rooms: the distance is then the median of those in groups of near frames.
 
     Args:
         rotation: (F, 3, 3), camera-to-world.
@@ -39,6 +51,10 @@ def estimate_depth(rotation: np.ndarray, position: np.ndarray) -> float:
     Returns:
         the median distance, above 0.
     """
+    if len(position) > MOST_COMPARED:
+        middle = np.linspace(0, len(position) - 1, GROUPS).round().astype(int)
+        _, groups = cKDTree(position).query(position[middle], GROUP)
+        return float(np.median([estimate_depth(rotation[group], position[group]) for group in groups]))
     axis = rotation[:, :, 2]
     across = np.eye(3) - axis[:, :, None] * axis[:, None, :]
     normal = across.sum(axis=0)
@@ -59,23 +75,34 @@ def choose_pairs(frames: MapFrames, depth: float) -> np.ndarray:
         (P, 2) int64, first frame below the second, in ascending order.
     """
     partners = PARTNERS if len(frames) > FEW_FRAMES else PARTNERS_OF_FEW
-    seen = _measure_overlaps(frames, depth)
-    baseline = np.linalg.norm(frames.position[:, None] - frames.position[None], axis=2)
-    candidate = (np.minimum(seen, seen.T) >= MIN_OVERLAP) & (baseline >= MIN_BASELINE * depth)
+    both = _measure_overlaps(frames, depth)
     pairs: set[tuple[int, int]] = set()
-    for i, row in enumerate(candidate):
-        others = np.flatnonzero(row)
-        others = others[np.argsort(baseline[i, others], kind="stable")]
+    for i, (first, last) in enumerate(pairwise(both.indptr)):
+        others = both.indices[first:last]
+        baseline = np.linalg.norm(frames.position[others] - frames.position[i], axis=1)
+        kept = baseline >= MIN_BASELINE * depth
+        others = others[kept][np.argsort(baseline[kept], kind="stable")]
         chosen = np.unique(np.linspace(0, len(others) - 1, partners).round().astype(int)) if len(others) else []
         pairs.update((min(i, j), max(i, j)) for j in others[chosen].tolist())
     return np.array(sorted(pairs), np.int64).reshape(-1, 2)
 
 
-def _measure_overlaps(frames: MapFrames, depth: float) -> np.ndarray:
-    """(F, F): the share of frame i's image, at the nominal depth, that frame j sees.
+def _list_candidates(frames: MapFrames, depth: float) -> Iterator[np.ndarray | slice]:
+    """Of each frame, those that it is compared with, in ascending order."""
+    if len(frames) <= MOST_COMPARED:
+        yield from repeat(slice(None), len(frames))
+        return
+    looked_at = frames.position + depth * frames.rotation[:, :, 2]
+    tree = cKDTree(looked_at)
+    for place in looked_at:
+        yield np.sort(tree.query(place, MOST_COMPARED)[1])
 
-    A camera sees what lies inside the four planes through its centre and the sides of its image: one product of all
-    planes with all points.
+
+def _measure_overlaps(frames: MapFrames, depth: float) -> sparse.csr_matrix:
+    """(F, F): the share of either image, at the nominal depth, that the other sees, where that is `MIN_OVERLAP` at least.
+
+    A camera sees what lies inside the four planes through its centre and the sides of its image: one product of the
+    planes of all candidates with the points that a frame sees.
     """
     n = len(frames)
     x, y = np.meshgrid(*(np.linspace(-1, 1, count) for count in GRID))
@@ -89,8 +116,17 @@ def _measure_overlaps(frames: MapFrames, depth: float) -> np.ndarray:
     outward[:, :, 2] = -frames.half_view[:, [0, 0, 1, 1]]
     normal = outward @ np.swapaxes(frames.rotation, 1, 2)
     offset = -(normal @ centre[:, :, None])
-    planes = np.moveaxis(np.concatenate([normal, offset], axis=2), 1, 0).reshape(4 * n, 4).astype(np.float32)
-    overlap = np.empty((n, n))
-    for i, view in enumerate(points):
-        overlap[i] = ((planes @ view.T).reshape(4, n, -1).max(axis=0) <= 0).mean(axis=1)
-    return overlap
+    planes = np.ascontiguousarray(np.moveaxis(np.concatenate([normal, offset], axis=2), 1, 0), np.float32)
+    number, rows, columns, shares = np.arange(n), [], [], []
+    for i, (view, others) in enumerate(zip(points, _list_candidates(frames, depth), strict=True)):
+        some = planes[:, others]
+        outside = (some.reshape(-1, 4) @ view.T).reshape(4, some.shape[1], -1).max(axis=0)
+        share = (outside <= 0).mean(axis=1)
+        kept = share >= MIN_OVERLAP
+        columns.append(number[others][kept])
+        shares.append(share[kept])
+        rows.append(np.full(len(columns[-1]), i))
+    seen = sparse.csr_matrix((np.concatenate(shares), (np.concatenate(rows), np.concatenate(columns))), (n, n))
+    both = seen.minimum(seen.T).tocsr()
+    both.sort_indices()
+    return both

@@ -8,6 +8,7 @@ from lightning_pose.geometry.absolute_pose import CameraPose
 from lightning_pose.mapping.frames import MapQuery, find_distance_scale
 from lightning_pose.mapping.point_map import PointMap
 from lightning_pose.mapping.threads import multiply
+from lightning_pose.mapping.vote_index import VoteIndex
 
 __all__ = ["QueryMatcher"]
 
@@ -16,12 +17,6 @@ CANDIDATES = 12
 
 VOTE_DISTANCE = 0.6
 """Largest distance of descriptors for a vote."""
-
-VOTE_COLUMNS = 24
-"""Dimensions in which the nearest point is found for a vote."""
-
-VOTE_ROWS = 50
-"""Keypoints that are compared at once: as many as fit a processor's cache."""
 
 FRAME_PRIOR = 20.0
 """Points added to a frame's own when its votes are divided by the root of their number."""
@@ -36,6 +31,9 @@ GUIDED_DISTANCE = 0.7
 GUIDED_RATIO = 0.9
 SIZE_OCTAVES = 1.0
 """How many octaves a keypoint may be larger or smaller than the point should appear."""
+
+MOST_NEAR = 1000
+"""Training frames near a pose whose points it may show."""
 
 MIN_COSINE = 0.5
 """Of the angle between a view of a point and the mean of those it was seen under: 60 degrees."""
@@ -53,8 +51,8 @@ class QueryMatcher:
     def __init__(self, point_map: PointMap) -> None:
         self.map = point_map
         self._descriptors = point_map.unit_descriptors
-        self._main_axes = find_main_axes(self._descriptors, VOTE_COLUMNS)
-        self._few_columns = multiply(self._main_axes.T, self._descriptors.T)
+        self._depth = point_map.measure_depth()
+        self._index = VoteIndex(self._descriptors)
         length = np.bincount(point_map.seen_point, minlength=len(point_map))
         self._vote = 1 / np.sqrt(np.maximum(length, 1))
         self._points_of_frame = point_map.seen_count.astype(np.int64)
@@ -65,8 +63,7 @@ class QueryMatcher:
     def match_candidates(self, descriptors: np.ndarray) -> tuple[int, np.ndarray, np.ndarray]:
         """Mutual matches with what the most likely training frames saw.
 
-        Each keypoint's nearest point votes for the frames that saw it; the nearest in few dimensions, which is found in
-        a third of the time and votes as well.
+        Each keypoint's nearest point votes for the frames that saw it.
 
         Args:
             descriptors: (N, D), of an image.
@@ -77,9 +74,7 @@ class QueryMatcher:
         if not len(descriptors) or not len(self._descriptors):
             return -1, NONE, NONE
         rows = np.arange(len(descriptors))
-        few = multiply(descriptors, self._main_axes)
-        parts = [few[first : first + VOTE_ROWS] for first in range(0, len(few), VOTE_ROWS)]
-        nearest = np.concatenate([multiply(part, self._few_columns).argmax(axis=1) for part in parts])
+        nearest = self._index.find_nearest(descriptors)
         voted = nearest[self._compare(descriptors, rows, nearest) > 1 - VOTE_DISTANCE**2 / 2]
         first, last = self._first_of_point[voted], self._first_of_point[voted + 1]
         votes = np.bincount(
@@ -87,9 +82,7 @@ class QueryMatcher:
         )
         score = votes / np.sqrt(self._points_of_frame + FRAME_PRIOR)
         best = np.argsort(-score, kind="stable")[:CANDIDATES]
-        likely = np.zeros(len(self.map), bool)
-        likely[self.map.seen_point[_join_ranges(self._first_of_frame[best], self._first_of_frame[best + 1])]] = True
-        points = np.flatnonzero(likely)
+        points = self._list_seen(best)
         if len(points) < 2:
             return int(best[0]), NONE, NONE
         among = multiply(descriptors, self._descriptors[points].T)
@@ -117,17 +110,19 @@ class QueryMatcher:
             keypoints (K,), points (K,), and where the points that should be in view appear, (V, 2) normalised image
             coordinates.
         """
-        away = self.map.points - pose.position
+        near = self._list_near(pose)
+        away = self.map.points[near] - pose.position
         local = away @ pose.rotation
         distance = np.linalg.norm(away, axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
             seen = local[:, :2] / local[:, 2:]
             inside = (np.abs(seen) <= query.half_view).all(axis=1) & (local[:, 2] > 0)
-        visible = np.flatnonzero(inside & (-(away * self.map.direction).sum(axis=1) >= MIN_COSINE * distance))
+        visible = np.flatnonzero(inside & (-(away * self.map.direction[near]).sum(axis=1) >= MIN_COSINE * distance))
         seen = seen[visible]
         row, column = find_near_places(points, seen, radius_px / query.focal_px)
-        point = visible[column]
-        octaves = np.log2(query.size_px[row] / query.focal_px) - (self.map.log_size[point] - np.log2(distance[point]))
+        point = near[visible[column]]
+        expected = self.map.log_size[point] - np.log2(distance[visible[column]])
+        octaves = np.log2(query.size_px[row] / query.focal_px) - expected
         alike = np.abs(octaves) <= SIZE_OCTAVES
         row, point = row[alike], point[alike]
         value = self._compare(query.descriptors, row, point)
@@ -138,17 +133,29 @@ class QueryMatcher:
         chosen = best & best_of_point & (1 - value < GUIDED_RATIO**2 * (1 - second))
         return row[chosen], point[chosen], seen
 
+    def _list_seen(self, frames: np.ndarray) -> np.ndarray:
+        """Numbers of the points that any of some training frames saw, in ascending order."""
+        seen = np.zeros(len(self.map), bool)
+        seen[self.map.seen_point[_join_ranges(self._first_of_frame[frames], self._first_of_frame[frames + 1])]] = True
+        return np.flatnonzero(seen)
+
+    def _list_near(self, pose: CameraPose) -> np.ndarray:
+        """Numbers of the points that a camera may see: those of the training frames nearest to it, if there are more.
+
+        A map of many rooms has many points behind walls, which would cost time and match by chance.
+        """
+        frames = self.map.position
+        if len(frames) <= MOST_NEAR:
+            return np.arange(len(self.map))
+        away = np.linalg.norm(frames - pose.position, axis=1) / self._depth
+        turned = 1 - self.map.rotation[:, :, 2] @ pose.rotation[:, 2]
+        return self._list_seen(np.argpartition(away + turned, MOST_NEAR)[:MOST_NEAR])
+
     def _compare(self, descriptors: np.ndarray, row: np.ndarray, point: np.ndarray) -> np.ndarray:
         """(K,) cosines between an image's descriptors and those of points, as they would be of SURF."""
         similarity = np.einsum("kd,kd->k", descriptors[row], self._descriptors[point])
         scale = find_distance_scale(descriptors)
         return similarity if scale == 1 else 1 - (1 - similarity) / scale**2
-
-
-def find_main_axes(descriptors: np.ndarray, count: int) -> np.ndarray:
-    """(D, count or D) float32, the axes along which (P, D) descriptors are longest, in all."""
-    _, axes = np.linalg.eigh(multiply(descriptors.T, descriptors).astype(np.float64))
-    return np.ascontiguousarray(axes[:, ::-1][:, :count], dtype=np.float32)
 
 
 def find_near_places(points: np.ndarray, places: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:

@@ -29,17 +29,22 @@ def join_tracks(
     nodes, index = np.unique(ids, return_inverse=True)
     index = index.reshape(-1, 2)
     parent = list(range(len(nodes)))
-    members = [1 << frame for frame in (nodes // n_keypoints).tolist()]  # of each root: one bit for each frame
+    frames = (nodes // n_keypoints).tolist()
+    members: dict[int, set[int]] = {}  # frames of each root that has more than its own
     order = np.lexsort((ids[:, 1], ids[:, 0], matches.distance))
     for a, b in zip(*index[order].T.tolist(), strict=True):
         while parent[a] != a:
             parent[a] = a = parent[parent[a]]
         while parent[b] != b:
             parent[b] = b = parent[parent[b]]
-        if a != b and not members[a] & members[b]:
-            if a > b:
-                a, b = b, a
-            members[a] |= members[b]
+        if a == b:
+            continue
+        if a > b:
+            a, b = b, a
+        one, other = members.get(a) or {frames[a]}, members.get(b) or {frames[b]}
+        if one.isdisjoint(other):
+            members[a] = one | other
+            members.pop(b, None)
             parent[b] = a
     root = np.array(parent, np.int64)
     while not np.array_equal(root, root[root]):
