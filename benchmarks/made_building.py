@@ -12,13 +12,13 @@ from lightning_pose.mapping.frames import MapFrames
 __all__ = ["Building", "make_building", "walk_through"]
 
 ROOM_M = np.array([5.0, 5.0, 2.6])
-POINTS_PER_ROOM = 1500
-FRAMES_PER_ROOM = 100
+POINTS_PER_ROOM = 1200
+FRAMES_PER_ROOM = 200
 KEYPOINTS = 300
 CLUTTER = 60
 """Keypoints of each frame that are of nothing in particular."""
 
-REPEATED = 0.6
+REPEATED = 0.75
 """Share of the points in view whose keypoints are found."""
 
 WIDTH, HEIGHT, FOCAL_PX = 640, 480, 525.0
@@ -55,16 +55,21 @@ def make_building(rooms: int) -> Building:
 
 
 def walk_through(building: Building, per_room: int, seed: int) -> tuple[MapFrames, np.ndarray, np.ndarray]:
-    """Frames of a walk through all rooms, with drifting poses; also the true rotations (F, 3, 3) and positions (F, 3)."""
+    """Frames of a walk through all rooms, with drifting poses; also the true rotations (F, 3, 3) and positions (F, 3).
+
+    The walks of different seeds lie beside each other.
+    """
     rng = np.random.default_rng([seed, 1])
     rooms = len(building.points)
     t = (np.arange(per_room) + rng.random()) / per_room
-    phase = rng.uniform(0, 2 * np.pi, (rooms, 3, 1))
-    yaw = phase[:, 0] + 2 * np.pi * t
-    place = np.stack([0.5 + 0.22 * np.cos(yaw + phase[:, 1]), 0.5 + 0.22 * np.sin(yaw + phase[:, 2]), 0.55 + 0 * yaw])
+    phase = np.random.default_rng(2).uniform(0, 2 * np.pi, (rooms, 3, 1)) + 0.25 * seed
+    yaw = phase[:, 0] + 4 * np.pi * t
+    place = np.stack(
+        [0.5 + 0.22 * np.cos(yaw / 2 + phase[:, 1]), 0.5 + 0.22 * np.sin(yaw / 2 + phase[:, 2]), 0.55 + 0 * yaw]
+    )
     place[2] += 0.05 * np.sin(3 * yaw)
     position = (building.corner[:, None] + np.moveaxis(place, 0, 2) * ROOM_M).reshape(-1, 3)
-    tilt = 0.15 * np.sin(2 * yaw + phase[:, 1])
+    tilt = 0.15 * np.sin(1.5 * yaw + phase[:, 1])
     forward = np.stack([np.cos(yaw) * np.cos(tilt), np.sin(yaw) * np.cos(tilt), np.sin(tilt)], axis=2).reshape(-1, 3)
     right = np.cross(forward, [0, 0, 1.0])
     right /= np.linalg.norm(right, axis=1, keepdims=True)

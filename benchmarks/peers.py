@@ -36,7 +36,8 @@ from lightning_pose.mapping.build_map import adjust_mapped, map_frames, summariz
 from lightning_pose.mapping.calibration import measure_frames
 from lightning_pose.mapping.frames import MapFrames
 from lightning_pose.mapping.map_localizer import MapLocalizer
-from lightning_pose.mapping.pairs import choose_pairs, estimate_depth
+from lightning_pose.mapping.pairs import choose_pairs
+from lightning_pose.mapping.scene_depth import estimate_depth
 from lightning_pose.models.parts.map_network import keypoints_to_frames
 from lightning_pose.scenes.images import read_gray
 from lightning_pose.scenes.scene import Scene
@@ -114,7 +115,7 @@ def triangulate(scene: Scene, frames: np.ndarray, camera: Camera, features: list
         np.zeros((n, 1, 2)), nothing, nothing[:, None], np.zeros(n), np.full(n, camera.focal_px),
         np.tile(camera.half_view, (n, 1)), rotation, position,
     )  # fmt: skip
-    pairs = choose_pairs(posed, estimate_depth(rotation, position))
+    pairs = choose_pairs(posed, estimate_depth(rotation, position)).pairs
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "database.db"
         model = pycolmap.Reconstruction()

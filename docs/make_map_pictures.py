@@ -38,7 +38,8 @@ from lightning_pose.mapping.depth_vote import AGREE_PX, vote_depths
 from lightning_pose.mapping.frames import MapFrames
 from lightning_pose.mapping.guided_matching import BAND_PX, KeypointMatches, match_pairs
 from lightning_pose.mapping.map_localizer import MapAnswer, MapLocalizer
-from lightning_pose.mapping.pairs import choose_pairs, estimate_depth
+from lightning_pose.mapping.pairs import choose_pairs
+from lightning_pose.mapping.scene_depth import measure_depth
 from lightning_pose.models.parts.map_network import keypoints_to_frames
 from lightning_pose.scenes.images import read_rgb, to_gray
 
@@ -90,7 +91,7 @@ def read_stage() -> Stage:
     camera = datamodule.find_camera(int(datamodule.scene.splits["train"][0]))
     assert camera is not None, "the room knows its camera"
     train, test = (_read_frames(datamodule, camera, split) for split in ("train", "test"))
-    pairs = choose_pairs(train, estimate_depth(train.rotation, train.position))
+    pairs = choose_pairs(train, measure_depth(train)).pairs
     return Stage(datamodule, camera, train, test, pairs, match_pairs(train, pairs))
 
 

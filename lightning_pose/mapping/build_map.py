@@ -4,88 +4,42 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
 from lightning_pose.geometry.absolute_pose import CameraPose
 from lightning_pose.geometry.rolling_shutter import remove_rolling
-from lightning_pose.geometry.triangulation import (
-    find_midpoints,
-    refine_points,
-    reprojection_errors,
-    sum_by_track,
-    widest_angles_deg,
-)
+from lightning_pose.geometry.triangulation import sum_by_track
 from lightning_pose.mapping.bundle_adjustment import Adjustment, adjust_bundle
 from lightning_pose.mapping.camera_correction import CameraCorrection
-from lightning_pose.mapping.depth_vote import vote_depths
 from lightning_pose.mapping.frames import MapFrames, find_turn_rates
-from lightning_pose.mapping.guided_matching import match_pairs
-from lightning_pose.mapping.pairs import FEW_FRAMES, choose_pairs, estimate_depth
+from lightning_pose.mapping.pairs import choose_pairs
 from lightning_pose.mapping.point_map import PointMap, quantize_descriptors
-from lightning_pose.mapping.threads import map_in_threads
-from lightning_pose.mapping.tracks import join_tracks
+from lightning_pose.mapping.scene_depth import measure_depth
+from lightning_pose.mapping.track_points import Tracks, find_tracks, triangulate_tracks
 
 __all__ = [
-    "GATES_PX",
     "MappedFrames",
     "PointSums",
-    "Tracks",
     "add_frames",
     "adjust_mapped",
     "build_point_map",
-    "find_tracks",
+    "find_points",
     "map_frames",
     "roll_mapped",
     "sum_observations",
     "summarize_tracks",
-    "triangulate_tracks",
 ]
 
 MIN_OBSERVATIONS = 5
 """Frames that must see a point. (3 doubles the map and gains nothing.)"""
 
 MIN_OBSERVATIONS_OF_FEW = 3
-"""The same where there are at most `FEW_FRAMES`."""
-
-MIN_ANGLE_DEG = 1.5
-"""Angle between the widest rays of a point."""
+"""The same where frames overlap with few others."""
 
 ADJUSTMENTS = 2
 """Rounds of matching, triangulation and bundle adjustment."""
-
-HUBER_PX = 1.5
-"""An observation counts in full up to this error."""
-
-PART = 2**14
-"""Observations whose tracks are refined at once: as many as fit a processor's cache."""
-
-GATES_PX = (12.0, 6.0, 3.0)
-"""Observations farther than this from their point are left out, gate after gate."""
-
-
-@dataclass(frozen=True)
-class Tracks:
-    """O observations of T points.
-
-    Attributes:
-        track: (O,) int64, ascending.
-        frame: (O,) int64.
-        keypoint: (O,) int64, row in the frame.
-        points: (T, 3) float64, where each point is.
-    """
-
-    track: np.ndarray
-    frame: np.ndarray
-    keypoint: np.ndarray
-    points: np.ndarray
-
-    def select(self, observations: np.ndarray) -> Tracks:
-        """These observations (a mask), and the points that they see, numbered anew."""
-        kept, track = np.unique(self.track[observations], return_inverse=True)
-        return Tracks(track, self.frame[observations], self.keypoint[observations], self.points[kept])
 
 
 @dataclass(frozen=True)
@@ -144,7 +98,7 @@ def map_frames(frames: MapFrames, adjust: bool) -> MappedFrames:
         adjust: move poses, points and camera until they agree with the images, twice: poses that are better find
             more matches. Without it, the given poses are taken as they are.
     """
-    mapped = MappedFrames(frames, frames, triangulate_tracks(frames, find_tracks(frames)))
+    mapped = MappedFrames(frames, frames, find_points(frames))
     return adjust_mapped(mapped) if adjust else mapped
 
 
@@ -154,7 +108,7 @@ def adjust_mapped(mapped: MappedFrames) -> MappedFrames:
     state = Adjustment(given.rotation, given.position, tracks.points)
     for again in range(ADJUSTMENTS):
         if again:
-            tracks = triangulate_tracks(seen, find_tracks(seen))
+            tracks = find_points(seen)
         state, seen, tracks = _adjust_once(state, given, tracks)
     return MappedFrames(given, seen, triangulate_tracks(seen, tracks), state)
 
@@ -194,7 +148,7 @@ def add_frames(mapped: MappedFrames, given: MapFrames, rows: np.ndarray, others:
         position[row] = pose.position - rotation[row] @ old.offset_position
     start = replace(old, rotation=rotation, position=position)
     seen = _move_frames(start, given)
-    tracks = triangulate_tracks(seen, find_tracks(seen))
+    tracks = find_points(seen)
     state, seen, tracks = _adjust_once(start, given, tracks)
     return MappedFrames(given, seen, triangulate_tracks(seen, tracks), state)
 
@@ -213,43 +167,11 @@ def _move_frames(state: Adjustment, given: MapFrames) -> MapFrames:
     return replace(given.with_poses(*state.camera_poses), points=points)
 
 
-def find_tracks(frames: MapFrames) -> Tracks:
-    """Tracks of keypoints, at the least squares point of their rays."""
-    matches = match_pairs(frames, choose_pairs(frames, estimate_depth(frames.rotation, frames.position)))
-    matches = matches.select(vote_depths(frames, matches))
-    track, frame, keypoint = join_tracks(matches, frames.points.shape[1], count_observations(frames))
-    n_tracks = int(track[-1]) + 1 if len(track) else 0
-    points = find_midpoints(track, frames.position[frame], find_rays(frames, frame, keypoint), n_tracks)
-    return Tracks(track, frame, keypoint, points)
-
-
-def triangulate_tracks(frames: MapFrames, tracks: Tracks, gates_px: Sequence[float] = GATES_PX) -> Tracks:
-    """Refined points, with the observations that agree with them; points with too few, or too narrow ones, are gone."""
-    for gate_px in gates_px:
-        frame, observed = tracks.frame, frames.points[tracks.frame, tracks.keypoint]
-        centre, rotation, focal_px = frames.position[frame], frames.rotation[frame], frames.focal_px[frame]
-        points = _refine_in_parts(tracks, (centre, rotation, observed, HUBER_PX / focal_px))
-        error = np.linalg.norm(reprojection_errors(points[tracks.track], centre, rotation, observed), axis=1)
-        near = error * focal_px <= gate_px
-        count = np.bincount(tracks.track[near], minlength=len(points))
-        near &= count[tracks.track] >= count_observations(frames)
-        tracks = Tracks(tracks.track, frame, tracks.keypoint, points).select(near)
-    rays = find_rays(frames, tracks.frame, tracks.keypoint)
-    wide = widest_angles_deg(tracks.track, rays, len(tracks.points)) >= MIN_ANGLE_DEG
-    return tracks.select(wide[tracks.track])
-
-
-def _refine_in_parts(tracks: Tracks, columns: tuple[np.ndarray, ...]) -> np.ndarray:
-    """`refine_points` of some tracks at a time; `columns` are what it takes of each observation."""
-    starts = np.unique(tracks.track[::PART])
-
-    def refine(first: int, last: int) -> np.ndarray:
-        rows = slice(*np.searchsorted(tracks.track, [first, last]))
-        centre, rotation, observed, huber = (each[rows] for each in columns)
-        return refine_points(tracks.points[first:last], tracks.track[rows] - first, centre, rotation, observed, huber)
-
-    parts = map_in_threads(lambda ends: refine(*ends), pairwise([*starts.tolist(), len(tracks.points)]))
-    return np.concatenate([tracks.points[:0], *parts])
+def find_points(frames: MapFrames) -> Tracks:
+    """Points of frames, from new matches."""
+    pairs, few = choose_pairs(frames, measure_depth(frames))
+    fewest = MIN_OBSERVATIONS_OF_FEW if few else MIN_OBSERVATIONS
+    return triangulate_tracks(frames, find_tracks(frames, pairs, fewest))
 
 
 def summarize_tracks(mapped: MappedFrames) -> PointMap:
@@ -285,15 +207,3 @@ def sum_observations(frames: MapFrames, tracks: Tracks, n_points: int) -> PointS
         sum_by_track(tracks.track, np.log2(size)[:, None], n_points),
         sum_by_track(tracks.track, descriptors, n_points),
     )
-
-
-def count_observations(frames: MapFrames) -> int:
-    """How many frames must see a point."""
-    return MIN_OBSERVATIONS if len(frames) > FEW_FRAMES else MIN_OBSERVATIONS_OF_FEW
-
-
-def find_rays(frames: MapFrames, frame: np.ndarray, keypoint: np.ndarray) -> np.ndarray:
-    """(O, 3) unit directions in the world of keypoints `keypoint` of frames `frame`."""
-    local = np.column_stack([frames.points[frame, keypoint], np.ones(len(frame))])
-    rays = np.einsum("oij,oj->oi", frames.rotation[frame], local)
-    return rays / np.linalg.norm(rays, axis=1, keepdims=True)

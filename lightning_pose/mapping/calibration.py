@@ -8,10 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lightning_pose.mapping.build_map import GATES_PX, MappedFrames, summarize_tracks, triangulate_tracks
+from lightning_pose.mapping.build_map import MappedFrames, summarize_tracks
 from lightning_pose.mapping.frames import MapFrames
 from lightning_pose.mapping.map_localizer import MapAnswer, MapLocalizer
 from lightning_pose.mapping.threads import map_in_threads
+from lightning_pose.mapping.track_points import GATES_PX, triangulate_tracks
 
 __all__ = [
     "MIN_ANSWERS",

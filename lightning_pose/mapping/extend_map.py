@@ -12,11 +12,9 @@ from lightning_pose.geometry.triangulation import reprojection_errors
 from lightning_pose.mapping.build_map import (
     MappedFrames,
     PointSums,
-    Tracks,
-    find_tracks,
+    find_points,
     sum_observations,
     summarize_tracks,
-    triangulate_tracks,
 )
 from lightning_pose.mapping.calibration import locate_frames
 from lightning_pose.mapping.frames import MapFrames, find_turn_rates
@@ -24,6 +22,7 @@ from lightning_pose.mapping.map_localizer import INLIER_PX, MapLocalizer
 from lightning_pose.mapping.point_map import PointMap, quantize_descriptors
 from lightning_pose.mapping.query_matching import QueryMatcher
 from lightning_pose.mapping.threads import map_in_threads
+from lightning_pose.mapping.track_points import Tracks
 
 __all__ = ["extend_map"]
 
@@ -40,7 +39,7 @@ def extend_map(old: PointMap, frames: MapFrames) -> PointMap:
         frames: of the other recording, with the poses that its dataset gives, in the world of the map.
     """
     seen = _place_frames(old, frames)
-    tracks = triangulate_tracks(seen, find_tracks(seen))
+    tracks = find_points(seen)
     point_of = _match_old_points(old, seen)
     owner = _find_owners(point_of[tracks.frame, tracks.keypoint], tracks)
     new = tracks.select(owner[tracks.track] < 0)
@@ -130,7 +129,7 @@ def _join_old_observations(
     near = np.linalg.norm(error, axis=1) * seen.focal_px[frame] <= INLIER_PX
     frame, keypoint, point = frame[near], keypoint[near], point[near]
     _, first = np.unique(point * len(seen) + frame, return_index=True)
-    return Tracks(point[first], frame[first], keypoint[first], old.points)
+    return Tracks(point[first], frame[first], keypoint[first], old.points, tracks.fewest)
 
 
 def _average_old_points(old: PointMap, new: PointSums) -> PointMap:

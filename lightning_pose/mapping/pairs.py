@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import pairwise, repeat
+from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
@@ -11,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from lightning_pose.mapping.frames import MapFrames
 
-__all__ = ["FEW_FRAMES", "choose_pairs", "estimate_depth"]
+__all__ = ["FramePairs", "choose_pairs"]
 
 MIN_OVERLAP = 0.4
 """Share of either image that the other must see, at the nominal depth."""
@@ -23,68 +24,54 @@ PARTNERS = 8
 """Partners chosen for each frame, spread evenly from the nearest to the farthest. 12 took longer and gained nothing."""
 
 PARTNERS_OF_FEW = 20
-"""The same where there are at most `FEW_FRAMES`: photos, in which each point is seen by few."""
+"""The same where the median frame overlaps with at most `FEW_OVERLAPS` others: photos, or a walk that passes once."""
 
-FEW_FRAMES = 200
+FEW_OVERLAPS = 50
 
 MOST_COMPARED = 1000
-"""Up to so many frames, all are compared with each other; of more, each with so many that look at places near its own."""
-
-GROUPS, GROUP = 50, 200
-"""Where there are more, this many groups of so many frames near each other say how far away things are."""
+"""Up to so many frames, all are compared with each other; of more, each with so many that look at near places."""
 
 GRID = (7, 5)
 """Points across and down an image that stand for what it sees."""
 
 
-def estimate_depth(rotation: np.ndarray, position: np.ndarray) -> float:
-    """A typical distance from the cameras to what they see: to the point that is nearest to all optical axes.
-
-    Needs no scale. Where the axes do not meet (a camera that looks outward as it goes), the point lies behind many
-    cameras, and the distance is of the order of the path's extent. More than `MOST_COMPARED` frames may be of many
-    rooms: the distance is then the median of those in groups of near frames.
-
-    Args:
-        rotation: (F, 3, 3), camera-to-world.
-        position: (F, 3).
-
-    Returns:
-        the median distance, above 0.
-    """
-    if len(position) > MOST_COMPARED:
-        middle = np.linspace(0, len(position) - 1, GROUPS).round().astype(int)
-        _, groups = cKDTree(position).query(position[middle], GROUP)
-        return float(np.median([estimate_depth(rotation[group], position[group]) for group in groups]))
-    axis = rotation[:, :, 2]
-    across = np.eye(3) - axis[:, :, None] * axis[:, None, :]
-    normal = across.sum(axis=0)
-    meeting = np.linalg.lstsq(normal, (across @ position[:, :, None]).sum(axis=0)[:, 0], rcond=1e-9)[0]
-    depth = float(np.median(np.linalg.norm(position - meeting, axis=1)))
-    extent = float(np.linalg.norm(np.ptp(position, axis=0)))
-    return max(depth, extent * 1e-3, np.finfo(float).tiny)
-
-
-def choose_pairs(frames: MapFrames, depth: float) -> np.ndarray:
+class FramePairs(NamedTuple):
     """Pairs of frames to match.
+
+    Attributes:
+        pairs: (P, 2) int64, first frame below the second, in ascending order.
+        few: whether frames overlap with so few others that each point is seen by few.
+    """
+
+    pairs: np.ndarray
+    few: bool
+
+
+def choose_pairs(frames: MapFrames, depth: float) -> FramePairs:
+    """Choose pairs of frames to match.
 
     Args:
         frames: with poses.
-        depth: nominal distance of what the frames see.
-
-    Returns:
-        (P, 2) int64, first frame below the second, in ascending order.
+        depth: typical distance of what the frames see.
     """
-    partners = PARTNERS if len(frames) > FEW_FRAMES else PARTNERS_OF_FEW
-    both = _measure_overlaps(frames, depth)
+    overlapping = list(_list_overlapping(frames, depth))
+    few = np.median([len(others) for others in overlapping] or [0]) <= FEW_OVERLAPS
+    partners = PARTNERS_OF_FEW if few else PARTNERS
     pairs: set[tuple[int, int]] = set()
+    for i, others in enumerate(overlapping):
+        chosen = np.unique(np.linspace(0, len(others) - 1, partners).round().astype(int)) if len(others) else []
+        pairs.update((min(i, j), max(i, j)) for j in others[chosen].tolist())
+    return FramePairs(np.array(sorted(pairs), np.int64).reshape(-1, 2), bool(few))
+
+
+def _list_overlapping(frames: MapFrames, depth: float) -> Iterator[np.ndarray]:
+    """Of each frame, those that see enough of the same from far enough away, the nearest first."""
+    both = _measure_overlaps(frames, depth)
     for i, (first, last) in enumerate(pairwise(both.indptr)):
         others = both.indices[first:last]
         baseline = np.linalg.norm(frames.position[others] - frames.position[i], axis=1)
         kept = baseline >= MIN_BASELINE * depth
-        others = others[kept][np.argsort(baseline[kept], kind="stable")]
-        chosen = np.unique(np.linspace(0, len(others) - 1, partners).round().astype(int)) if len(others) else []
-        pairs.update((min(i, j), max(i, j)) for j in others[chosen].tolist())
-    return np.array(sorted(pairs), np.int64).reshape(-1, 2)
+        yield others[kept][np.argsort(baseline[kept], kind="stable")]
 
 
 def _list_candidates(frames: MapFrames, depth: float) -> Iterator[np.ndarray | slice]:
@@ -99,7 +86,7 @@ def _list_candidates(frames: MapFrames, depth: float) -> Iterator[np.ndarray | s
 
 
 def _measure_overlaps(frames: MapFrames, depth: float) -> sparse.csr_matrix:
-    """(F, F): the share of either image, at the nominal depth, that the other sees, where that is `MIN_OVERLAP` at least.
+    """(F, F): the share of either image, at the nominal depth, that the other sees; 0 below `MIN_OVERLAP`.
 
     A camera sees what lies inside the four planes through its centre and the sides of its image: one product of the
     planes of all candidates with the points that a frame sees.

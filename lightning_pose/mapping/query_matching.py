@@ -32,8 +32,11 @@ GUIDED_RATIO = 0.9
 SIZE_OCTAVES = 1.0
 """How many octaves a keypoint may be larger or smaller than the point should appear."""
 
-MOST_NEAR = 1000
-"""Training frames near a pose whose points it may show."""
+MOST_NEAR = 300
+"""Training frames near a pose whose points it may show, where a map has more than `MOST_FRAMES`."""
+
+MOST_FRAMES = 1000
+"""Up to so many training frames, all points may be in view."""
 
 MIN_COSINE = 0.5
 """Of the angle between a view of a point and the mean of those it was seen under: 60 degrees."""
@@ -140,12 +143,12 @@ class QueryMatcher:
         return np.flatnonzero(seen)
 
     def _list_near(self, pose: CameraPose) -> np.ndarray:
-        """Numbers of the points that a camera may see: those of the training frames nearest to it, if there are more.
+        """Numbers of the points that a camera may see: those of the training frames nearest to it, or all.
 
         A map of many rooms has many points behind walls, which would cost time and match by chance.
         """
         frames = self.map.position
-        if len(frames) <= MOST_NEAR:
+        if len(frames) <= MOST_FRAMES:
             return np.arange(len(self.map))
         away = np.linalg.norm(frames - pose.position, axis=1) / self._depth
         turned = 1 - self.map.rotation[:, :, 2] @ pose.rotation[:, 2]

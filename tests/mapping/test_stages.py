@@ -14,8 +14,9 @@ from lightning_pose.mapping.camera_correction import CameraCorrection
 from lightning_pose.mapping.depth_vote import vote_depths
 from lightning_pose.mapping.frames import find_distance_scale, find_turn_rates
 from lightning_pose.mapping.guided_matching import KeypointMatches, match_pairs
-from lightning_pose.mapping.pairs import choose_pairs, estimate_depth
+from lightning_pose.mapping.pairs import choose_pairs
 from lightning_pose.mapping.point_map import quantize_descriptors
+from lightning_pose.mapping.scene_depth import estimate_depth
 from lightning_pose.mapping.tracks import join_tracks
 from tests.mapping.helpers import make_frames, make_walk
 
@@ -41,7 +42,7 @@ def test_pairs_see_the_same_and_stand_apart() -> None:
     turned = rotation.copy()
     turned[20:] = turned[20:] @ Rotation.from_euler("y", 180, degrees=True).as_matrix()
     position_m[5] = position_m[4]
-    pairs = choose_pairs(make_frames(turned, position_m), depth=3.0)
+    pairs = choose_pairs(make_frames(turned, position_m), depth=3.0).pairs
     assert (pairs[:, 0] < pairs[:, 1]).all()
     assert not ((pairs[:, 0] < 20) & (pairs[:, 1] >= 20)).any(), "a pair looks in opposite directions"
     assert not (pairs == [4, 5]).all(axis=1).any(), "a pair has no baseline"
