@@ -44,7 +44,7 @@ def measure(frames: int, threads: int, queries: int) -> dict[str, float]:
         return result
 
     plain = clock("as given", lambda: map_frames(given, adjust=False))
-    mapped = clock("adjustment", lambda: adjust_mapped(plain))
+    mapped = clock("adjustment", lambda: adjust_mapped(plain, rounds=2))
     clock("radii", lambda: calibrate_map(mapped))
     point_map = summarize_tracks(mapped)
     localizer = clock("load", lambda: MapLocalizer(point_map))

@@ -3,7 +3,7 @@
     python benchmarks/map_build.py --root DIR [--pgt DIR] [--threads 1 2] [--n_features 300]
 
 Stages: decoding the images of training and validation and extracting SURF; the map of the training frames; its bundle
-adjustment, with new matches; validation frames located with both; the validation frames added, with new matches and
+adjustment; validation frames located with both; the validation frames added, with new matches and
 adjustment once more, or where adjusting helped nothing a map of all frames as they are; the radii. Evaluation, imports
 and checkpoints are not in it. The hash of the map is the same for any number of threads.
 """
@@ -67,7 +67,7 @@ def build(every: MapFrames, is_val: np.ndarray) -> tuple[MapLocalizer, str]:
     """Build the map of training and validation frames; also its hash."""
     train, val, spent = every.select(np.flatnonzero(~is_val)), every.select(np.flatnonzero(is_val)), []
     plain = time_stage("map of the training frames", lambda: map_frames(train, adjust=False), spent)
-    adjusted = time_stage("bundle adjustment, twice", lambda: adjust_mapped(plain), spent)
+    adjusted = time_stage("bundle adjustment", lambda: adjust_mapped(plain, rounds=1), spent)
     found = time_stage(
         "validation frames located with both",
         lambda: [locate_frames(MapLocalizer(summarize_tracks(each)), val) for each in (plain, adjusted)],

@@ -264,7 +264,7 @@ def run_map(name: str, work: Work, scene: Scene, truth: str, camera: Camera) -> 
         asked = to_frames(features[torch.from_numpy(np.isin(every, val))], val)
         before, after = (
             np.median(measure_frames(MapLocalizer(summarize_tracks(each)), asked).position)
-            for each in (plain, adjust_mapped(plain))
+            for each in (plain, adjust_mapped(plain, rounds=2))
         )
         return bool(after < before)
 

@@ -32,14 +32,11 @@ __all__ = [
     "summarize_tracks",
 ]
 
-MIN_OBSERVATIONS = 5
-"""Frames that must see a point. (3 doubles the map and gains nothing.)"""
+MIN_OBSERVATIONS = 4
+"""Frames that must see a point. 5 accepts fewer training frames left out; 3 makes a larger map of no use."""
 
 MIN_OBSERVATIONS_OF_FEW = 3
 """The same where frames overlap with few others."""
-
-ADJUSTMENTS = 2
-"""Rounds of matching, triangulation and bundle adjustment."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +54,14 @@ class MappedFrames:
     seen: MapFrames
     tracks: Tracks
     state: Adjustment | None = None
+
+    @property
+    def depth(self) -> float:
+        """Median distance of the points from the frames that see them; 1 without points."""
+        if not len(self.tracks.points):
+            return 1.0
+        away = self.tracks.points[self.tracks.track] - self.seen.position[self.tracks.frame]
+        return float(np.median(np.linalg.norm(away, axis=1)))
 
     @property
     def camera(self) -> CameraCorrection:
@@ -98,17 +103,17 @@ def map_frames(frames: MapFrames, adjust: bool) -> MappedFrames:
         adjust: move poses, points and camera until they agree with the images, twice: poses that are better find
             more matches. Without it, the given poses are taken as they are.
     """
-    mapped = MappedFrames(frames, frames, find_points(frames))
-    return adjust_mapped(mapped) if adjust else mapped
+    mapped = MappedFrames(frames, frames, find_points(frames, measure_depth(frames)))
+    return adjust_mapped(mapped, rounds=2) if adjust else mapped
 
 
-def adjust_mapped(mapped: MappedFrames) -> MappedFrames:
-    """The same frames after bundle adjustment, twice, with new tracks between."""
+def adjust_mapped(mapped: MappedFrames, rounds: int) -> MappedFrames:
+    """The same frames after rounds of bundle adjustment, with new tracks between; one is enough for `add_frames`."""
     given, seen, tracks = mapped.given, mapped.seen, mapped.tracks
     state = Adjustment(given.rotation, given.position, tracks.points)
-    for again in range(ADJUSTMENTS):
+    for again in range(rounds):
         if again:
-            tracks = find_points(seen)
+            tracks = find_points(seen, mapped.depth)
         state, seen, tracks = _adjust_once(state, given, tracks)
     return MappedFrames(given, seen, triangulate_tracks(seen, tracks), state)
 
@@ -148,7 +153,7 @@ def add_frames(mapped: MappedFrames, given: MapFrames, rows: np.ndarray, others:
         position[row] = pose.position - rotation[row] @ old.offset_position
     start = replace(old, rotation=rotation, position=position)
     seen = _move_frames(start, given)
-    tracks = find_points(seen)
+    tracks = find_points(seen, mapped.depth)
     state, seen, tracks = _adjust_once(start, given, tracks)
     return MappedFrames(given, seen, triangulate_tracks(seen, tracks), state)
 
@@ -167,9 +172,9 @@ def _move_frames(state: Adjustment, given: MapFrames) -> MapFrames:
     return replace(given.with_poses(*state.camera_poses), points=points)
 
 
-def find_points(frames: MapFrames) -> Tracks:
-    """Points of frames, from new matches."""
-    pairs, few = choose_pairs(frames, measure_depth(frames))
+def find_points(frames: MapFrames, depth: float) -> Tracks:
+    """Points of frames, from new matches; `depth` is a typical distance of what the frames see."""
+    pairs, few = choose_pairs(frames, depth)
     fewest = MIN_OBSERVATIONS_OF_FEW if few else MIN_OBSERVATIONS
     return triangulate_tracks(frames, find_tracks(frames, pairs, fewest))
 

@@ -39,7 +39,7 @@ def extend_map(old: PointMap, frames: MapFrames) -> PointMap:
         frames: of the other recording, with the poses that its dataset gives, in the world of the map.
     """
     seen = _place_frames(old, frames)
-    tracks = find_points(seen)
+    tracks = find_points(seen, old.measure_depth())
     point_of = _match_old_points(old, seen)
     owner = _find_owners(point_of[tracks.frame, tracks.keypoint], tracks)
     new = tracks.select(owner[tracks.track] < 0)

@@ -93,7 +93,7 @@ class MapBuilder:
         camera = self._find_camera()
         frames = self._read_frames(splits, camera)
         if splits == ("train",):
-            mapped = self._choose_map(frames, camera)
+            mapped = self._choose_map(frames, camera, rounds=2 if calibrate else 1)
         elif self._adjusted is not None:
             mapped = self._add_validation_frames(self._adjusted, frames, camera)
         else:
@@ -114,12 +114,15 @@ class MapBuilder:
                 "(median)"
             )
 
-    def _choose_map(self, frames: MapFrames, camera: Camera) -> MappedFrames:
-        """The map of training frames, as given, adjusted, or with a rolling shutter: which locates frames best."""
+    def _choose_map(self, frames: MapFrames, camera: Camera, rounds: int) -> MappedFrames:
+        """The map of training frames, as given, adjusted, or with a rolling shutter: which locates frames best.
+
+        Adding validation frames is another round of adjustment.
+        """
         plain = map_frames(frames, adjust=False)
         if self.bundle_adjust is False or not len(plain.tracks.points):
             return plain
-        adjusted = adjust_mapped(plain)
+        adjusted = adjust_mapped(plain, rounds)
         rolled = roll_mapped(adjusted)
         candidates = [adjusted, rolled, *([plain] if self.bundle_adjust == "auto" else [])]
         if len(self.datamodule.scene.splits["val"]) >= FEWEST_VAL:
