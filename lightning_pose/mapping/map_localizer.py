@@ -20,6 +20,9 @@ __all__ = ["MapAnswer", "MapLocalizer", "ShownPoints"]
 MIN_MATCHES = 8
 """Fewer matches are no start for RANSAC."""
 
+FEW_CANDIDATES = 4
+"""Training frames whose points an image is matched to that was refused before."""
+
 RANSAC_PX = 6.0
 SIGMA_PX = 1.0
 """Scale of Cauchy's weights in the last refinement."""
@@ -160,8 +163,15 @@ class MapLocalizer:
         return away, float(np.degrees(np.linalg.norm(Rotation.from_matrix(a.rotation.T @ b.rotation).as_rotvec())))
 
     def _search(self, query: MapQuery, points: np.ndarray) -> MapAnswer:
-        """The pose among the points of the most similar training frames."""
-        return self._solve(query, points, self._matcher.match_candidates(query.descriptors))
+        """The pose among the points of the most similar training frames; if it is refused, of fewer of them.
+
+        Frames that look alike and show another place spoil the matches of the right ones, the more of them there are.
+        """
+        found = self._solve(query, points, self._matcher.match_candidates(query.descriptors))
+        if found.accepted:
+            return found
+        again = self._solve(query, points, self._matcher.match_candidates(query.descriptors, FEW_CANDIDATES))
+        return again if again.accepted or again.inliers > found.inliers else found
 
     def _solve(
         self,

@@ -63,13 +63,16 @@ class QueryMatcher:
         self._frames = point_map.seen_frame[np.argsort(point_map.seen_point, kind="stable")]
         self._first_of_point = np.concatenate([[0], np.cumsum(length)])
 
-    def match_candidates(self, descriptors: np.ndarray) -> tuple[int, np.ndarray, np.ndarray]:
+    def match_candidates(
+        self, descriptors: np.ndarray, candidates: int = CANDIDATES
+    ) -> tuple[int, np.ndarray, np.ndarray]:
         """Mutual matches with what the most likely training frames saw.
 
         Each keypoint's nearest point votes for the frames that saw it.
 
         Args:
             descriptors: (N, D), of an image.
+            candidates: how many frames.
 
         Returns:
             the most likely frame (-1 for none), and the keypoints (K,) and points (K,) of the matches.
@@ -84,7 +87,7 @@ class QueryMatcher:
             self._frames[_join_ranges(first, last)], np.repeat(self._vote[voted], last - first), len(self.map.position)
         )
         score = votes / np.sqrt(self._points_of_frame + FRAME_PRIOR)
-        best = np.argsort(-score, kind="stable")[:CANDIDATES]
+        best = np.argsort(-score, kind="stable")[:candidates]
         points = self._list_seen(best)
         if len(points) < 2:
             return int(best[0]), NONE, NONE
