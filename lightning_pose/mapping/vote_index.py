@@ -17,13 +17,13 @@ VOTE_ROWS = 50
 MOST_VOTED = 20_000
 """Up to so many points, all are compared with each keypoint."""
 
-VOTE_CELLS = 256
+VOTE_CELLS = 64
 """Cells into which more points are sorted, each around a centre."""
 
-VOTE_LOOKED_INTO = 6
+VOTE_LOOKED_INTO = 4
 """Cells of which the points are compared with a keypoint."""
 
-VOTE_SAMPLE, VOTE_ROUNDS = 20, 4
+VOTE_SAMPLE, VOTE_ROUNDS = 50, 4
 """Points for each cell, and rounds of k-means, to find the centres (Lloyd, 1982)."""
 
 
