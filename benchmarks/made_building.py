@@ -13,7 +13,7 @@ __all__ = ["Building", "make_building", "walk_through"]
 
 ROOM_M = np.array([5.0, 5.0, 2.6])
 POINTS_PER_ROOM = 1200
-FRAMES_PER_ROOM = 200
+FRAMES_PER_ROOM = 250
 KEYPOINTS = 300
 CLUTTER = 60
 """Keypoints of each frame that are of nothing in particular."""
