@@ -2,7 +2,7 @@
 
     python benchmarks/growth_map.py [--frames 1000 3000 10000] [--threads 1] [--queries 200]
 
-A made building with a room for every 250 frames: points on walls and furniture, 300 keypoints a frame with noise, a
+A made building with a room for every 500 frames: points on walls and furniture, 300 keypoints a frame with noise, a
 fifth of them clutter, poses that drift by 8 mm and 0.17 degrees. Each size has a process of its own. Stages are those
 of `fit`: the map as given, bundle adjustment with new matches between, and the radii. Seconds are CPU seconds. A query
 has no features in it. Errors are those of queries from another walk, against their true poses.
