@@ -63,9 +63,9 @@ def walk_through(building: Building, per_room: int, seed: int) -> tuple[MapFrame
     rooms = len(building.points)
     t = (np.arange(per_room) + rng.random()) / per_room
     phase = np.random.default_rng(2).uniform(0, 2 * np.pi, (rooms, 3, 1)) + 0.25 * seed
-    yaw = phase[:, 0] + 8 * np.pi * t
+    yaw = phase[:, 0] + 4 * np.pi * t
     place = np.stack(
-        [0.5 + 0.22 * np.cos(yaw / 4 + phase[:, 1]), 0.5 + 0.22 * np.sin(yaw / 4 + phase[:, 2]), 0.55 + 0 * yaw]
+        [0.5 + 0.22 * np.cos(yaw / 2 + phase[:, 1]), 0.5 + 0.22 * np.sin(yaw / 2 + phase[:, 2]), 0.55 + 0 * yaw]
     )
     place[2] += 0.05 * np.sin(3 * yaw)
     position = (building.corner[:, None] + np.moveaxis(place, 0, 2) * ROOM_M).reshape(-1, 3)
