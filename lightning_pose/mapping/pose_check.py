@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lightning_pose.errors import ImageError
-from lightning_pose.features.surf import SURF
+from lightning_pose.features.surf.numpy_surf import extract_surf
 from lightning_pose.geometry.camera import Camera
 from lightning_pose.geometry.triangulation import find_two_view_depths
 from lightning_pose.mapping.clock_offset import MAX_OFFSET_S, STEP_S, fit_clock_offset
@@ -22,6 +22,9 @@ __all__ = ["PoseCheck", "check_poses"]
 
 LONGEST_PX = 960
 """Larger images are shrunk to this before features are extracted."""
+
+MOST_FEATURES = 300
+"""SURF keypoints of an image, the strongest."""
 
 MIN_PAIRS = 10
 """Fewer pairs of frames with a baseline prove nothing."""
@@ -84,7 +87,7 @@ def check_poses(scene: Scene) -> PoseCheck:
     Args:
         scene: the dataset, as it was read.
     """
-    extractor, found = SURF(300), PoseCheck()
+    found = PoseCheck()
     scales: list[float] = []
     sizes: list[tuple[int, int]] = []
     counts: list[int] = []
@@ -98,14 +101,13 @@ def check_poses(scene: Scene) -> PoseCheck:
         scale = min(1.0, LONGEST_PX / max(size))
         if scale < 1:
             image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        (record,) = extractor.extract([image])
-        count = int(record["count"])
+        keypoints, descriptors = extract_surf(image, MOST_FEATURES, upright=True, threshold=0.0)  # torch takes seconds
         scales.append(scale)
         sizes.append(size)
-        counts.append(min(count, 300))
-        pixels = (record["keypoints"][:count, :2] + 0.5) / scale - 0.5
+        counts.append(len(keypoints))
+        pixels = (keypoints[:, :2] + 0.5) / scale - 0.5
         points = _undistort_points(pixels, scene.frames[frame].intrinsics, *size) * scale
-        return points, record["descriptors"][:count]
+        return points, descriptors
 
     matches = match_nearby_frames([frame.sequence for frame in scene.frames], read_keypoints)
     _judge_features(found, counts)
@@ -140,7 +142,8 @@ def _judge_features(found: PoseCheck, counts: list[int]) -> None:
     if not counts:
         return
     found.facts["features per frame"] = (
-        f"median {np.median(counts):.0f}, least {min(counts)}, of at most 300 SURF keypoints ({len(counts)} frames)"
+        f"median {np.median(counts):.0f}, least {min(counts)}, of at most {MOST_FEATURES} SURF keypoints "
+        f"({len(counts)} frames)"
     )
     few = sum(count < FEW_FEATURES for count in counts)
     if few:
