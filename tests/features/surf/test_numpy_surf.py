@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lightning_pose.features.surf.numpy_surf import extract_surf
 from lightning_pose.features import SURF
+from lightning_pose.features.surf.numpy_surf import extract_surf
 
 
 @pytest.fixture(scope="module")
