@@ -14,11 +14,11 @@ from datetime import date
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from statistics import median
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 __all__ = [
-    "Goal", "Measurement", "Options", "Seconds", "describe_machine", "format_table", "interleave", "time_process",
-    "time_work",
+    "Goal", "Measurement", "Options", "Seconds", "describe_machine", "format_table", "interleave",
+    "restore_measurement", "time_process", "time_work",
 ]  # fmt: skip
 
 ROOT = Path(__file__).parents[1]
@@ -113,6 +113,11 @@ class Measurement:
             (median(each.wall for each in rounds), median(each.cpu for each in rounds)) for rounds in (ours, theirs)
         )
         return Measurement(what, wall, peer, peer_wall, median(ratios), goal, cpu, peer_cpu)
+
+
+def restore_measurement(values: Mapping[str, Any]) -> Measurement:
+    """A measurement from its fields, as JSON has them."""
+    return Measurement(**{**values, "goal": Goal(*values["goal"])})
 
 
 def _format_number(value: float, cpu: float, unit: str) -> str:
