@@ -99,7 +99,9 @@ def _add_products(gram: Tensor, x: Tensor) -> None:
     """Add x.T @ x, of (N, D) rows, to the upper triangle of (D, D)."""
     if gram.is_cpu:  # half the products of a full one in 0.8 of the time that torch takes for the blocks below
         rows = np.ascontiguousarray(x.numpy())
-        dsyrk(1.0, rows.T, beta=1.0, c=gram.numpy().T, lower=True, overwrite_c=True)  # which is the upper one in C order
+        dsyrk(
+            1.0, rows.T, beta=1.0, c=gram.numpy().T, lower=True, overwrite_c=True
+        )  # which is the upper one in C order
         return
     width = -(-len(gram) // _BLOCKS)
     for i in range(0, len(gram), width):
