@@ -1,6 +1,6 @@
 """Time of building a landmark map as `fit` does it, stage by stage, from image files on.
 
-    python benchmarks/map_build.py --root DIR [--pgt DIR] [--threads 1 2] [--n_features 300]
+    python -m benchmarks.map_build --root DIR [--pgt DIR] [--threads 1 2] [--n_features 300]
 
 Stages: decoding the images of training and validation and extracting SURF; the map of the training frames; its bundle
 adjustment; validation frames located with both; the validation frames added, with new matches and
@@ -12,8 +12,11 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import redirect_stdout
+from io import StringIO
 from typing import TypeVar
 
 import cv2
@@ -21,6 +24,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from benchmarks.measurement import Goal, Measurement, Options, time_work
 from lightning_pose.data.scene_folders import SceneFolders
 from lightning_pose.features.surf import SURF
 from lightning_pose.geometry.absolute_pose import CameraPose
@@ -32,6 +36,8 @@ from lightning_pose.mapping.map_localizer import MapLocalizer
 from lightning_pose.models.parts.map_network import keypoints_to_frames
 from lightning_pose.scenes.images import read_gray
 from lightning_pose.scenes.scene import Scene
+
+LIMIT_S = 60
 
 Found = TypeVar("Found")
 
@@ -91,6 +97,24 @@ def build(every: MapFrames, is_val: np.ndarray) -> tuple[MapLocalizer, str]:
     return MapLocalizer(point_map), digest.hexdigest()[:12]
 
 
+def read_scene(root: str, pgt: str | None) -> Scene:
+    """The scene under its own poses, or under those of the pseudo ground truth."""
+    return SceneFolders(root, ground_truth="sfm" if pgt else "original", pgt=pgt).load(None, one_world=True)
+
+
+def measure(options: Options) -> Iterator[Measurement]:
+    """One row: everything from image files to a map with radii, one thread."""
+    cv2.setNumThreads(1)
+    torch.set_num_threads(1)
+    scene = read_scene(str(options.root), options.pgt)
+    numbers = np.sort(np.concatenate([scene.splits["train"], scene.splits["val"]]))
+    is_val = np.isin(numbers, scene.splits["val"])
+    with redirect_stdout(StringIO()):  # the table of stages
+        seconds = time_work(lambda: build(read_frames(scene, numbers, 300), is_val))
+    what = f"a landmark map of {len(numbers)} frames, from image files on"
+    yield Measurement(what, seconds.wall, "", math.nan, math.nan, Goal("ours", LIMIT_S), seconds.cpu)
+
+
 def main() -> None:
     """Print a table for each number of threads, as Markdown."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -100,8 +124,7 @@ def main() -> None:
     parser.add_argument("--n_features", type=int, default=300)
     args = parser.parse_args()
     cv2.setNumThreads(1)
-    truth = "sfm" if args.pgt else "original"
-    scene = SceneFolders(args.root, ground_truth=truth, pgt=args.pgt).load(None, one_world=True)
+    scene = read_scene(args.root, args.pgt)
     numbers = np.sort(np.concatenate([scene.splits["train"], scene.splits["val"]]))
     is_val = np.isin(numbers, scene.splits["val"])
     test = read_frames(scene, scene.splits["test"], args.n_features)

@@ -1,6 +1,6 @@
 """Time of a query, from an image file to a pose: whole, and stage by stage, beside OpenCV's SIFT on the same frames.
 
-    python benchmarks/query.py MODEL --images DIR [--frames 20] [--rounds 3]
+    python -m benchmarks.query MODEL --images DIR [--frames 20] [--rounds 3]
 
 MODEL is a checkpoint of a landmark map of SURF keypoints, or what else `Localizer.load` takes. One thread; CPU time,
 which other programs on the machine hardly change, medians over frames and rounds. SIFT detects and describes as many
@@ -10,9 +10,11 @@ keypoints as the map's extractor, in the same rounds.
 from __future__ import annotations
 
 import argparse
+import sys
+import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from statistics import median
 from typing import TypeVar
@@ -21,6 +23,7 @@ import cv2
 import numpy as np
 import torch
 
+from benchmarks.measurement import ROOT, Goal, Measurement, Options, time_process
 from lightning_pose import Localizer
 from lightning_pose.features.surf import SURF
 from lightning_pose.features.surf.descriptor import compute_descriptors
@@ -34,6 +37,7 @@ from lightning_pose.models.parts.map_network import keypoints_to_frames
 from lightning_pose.scenes.images import read_gray
 
 SUFFIXES = {".jpg", ".jpeg", ".png"}
+LIMIT_MS = 50
 
 Found = TypeVar("Found")
 
@@ -84,6 +88,37 @@ def time_stages(stages: Stages, path: Path, system: TrainedSystem, surf: SURF, m
     stages.time("map: last refinement", lambda: refine_pose(near, place[matched], points[rows], sigma))
 
 
+def measure(options: Options) -> Iterator[Measurement]:
+    """One row: queries of a map of 300 U-SURF, which is built of `--root`, from image files to poses."""
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    with tempfile.TemporaryDirectory() as folder:
+        data = ["--data.root", str(Path(str(options.root)).resolve()), "--report.log_model", "false"]
+        config = str(ROOT / "configs" / "landmark_map.yaml")
+        fit = [sys.executable, "-m", "lightning_pose", "fit", "--config", config, *data]
+        time_process(fit, Path(folder), {"LIGHTNING_POSE_CACHE": folder})
+        (checkpoint,) = Path(folder).glob("mlruns/checkpoints/*/best.ckpt")
+        localizer, sift, stages = Localizer.load(checkpoint), cv2.SIFT.create(300), Stages()
+    paths = find_images(Path(str(options.root)), 20)
+    localizer.localize(paths[0])
+    for path in paths * (options.rounds or 3):
+        gray = read_gray(path)
+        stages.time("SIFT", lambda gray=gray: sift.detectAndCompute(gray, None))
+        stages.time("query", lambda path=path: localizer.localize(path))
+    ours, theirs = stages.milliseconds["query"], stages.milliseconds["SIFT"]
+    ratio = median(a / b for a, b in zip(ours, theirs, strict=True))
+    what, peer = "a query of a landmark map, file to pose", "OpenCV's SIFT alone, 300 features"
+    yield Measurement(what, median(ours), peer, median(theirs), ratio, Goal("ours", LIMIT_MS), unit="ms CPU")
+
+
+def find_images(folder: Path, count: int) -> list[Path]:
+    """So many images, evenly spread over those of a folder and below it."""
+    paths = sorted(p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES and "depth" not in p.name)
+    if not paths:
+        raise SystemExit(f"no {', '.join(sorted(SUFFIXES))} images below {folder}; give a folder that has some")
+    return paths[:: max(len(paths) // count, 1)][:count]
+
+
 def main() -> None:
     """Print the median times, as Markdown."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -98,10 +133,7 @@ def main() -> None:
     surf, network = system.extractor, system.model.map_network
     if network is None or not isinstance(surf, SURF):
         raise SystemExit(f"{args.model} is no landmark map of SURF keypoints; give the checkpoint of one")
-    paths = sorted(p for p in args.images.rglob("*") if p.suffix.lower() in SUFFIXES and "depth" not in p.name)
-    paths = paths[:: max(len(paths) // args.frames, 1)][: args.frames]
-    if not paths:
-        raise SystemExit(f"no {', '.join(sorted(SUFFIXES))} images below {args.images}; give a folder that has some")
+    paths = find_images(args.images, args.frames)
     matcher = QueryMatcher(network.point_map)
     MapLocalizer(network.point_map)  # the first call builds tables
     sift, stages, ratios = cv2.SIFT.create(surf.n_features), Stages(), []

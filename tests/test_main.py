@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import errno
+import gc
 import subprocess
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -12,6 +14,7 @@ import pytest
 from lightning_pose import __main__
 from lightning_pose.__main__ import VERBS, main
 from lightning_pose.errors import ConfigError
+from lightning_pose.scenes.synthetic import render_room
 from tests.helpers import Workplace
 
 
@@ -91,6 +94,40 @@ def test_light_modules_stay_light() -> None:
     check = f"import sys\n{imports}\nsys.exit(', '.join(sorted({{'lightning', 'mlflow'}} & set(sys.modules))) or 0)"
     process = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True, check=False)
     assert process.returncode == 0, process.stderr
+
+
+def find_torch(code: str, *args: object) -> subprocess.CompletedProcess[str]:
+    """Run code that has `main` in a fresh Python; the last line that it prints says whether torch was imported."""
+    code = f"import sys\nfrom lightning_pose.__main__ import main\n{code}\nprint('torch' in sys.modules)"
+    return subprocess.run([sys.executable, "-c", code, *map(str, args)], capture_output=True, text=True, check=False)
+
+
+def test_help_imports_no_torch() -> None:
+    code = "for verb in sys.argv[1:]:\n  try: main([verb, '--help'])\n  except SystemExit: pass\nmain(['--help'])"
+    verbs = ["localize", "report", "check", "export", "export-map", "reconstruct", "serve", "synth"]
+    found = find_torch(code, *verbs)
+    assert found.stdout.splitlines()[-1] == "False", found.stderr
+    assert found.stdout.count("usage: ") == 9
+
+
+def test_a_check_that_matches_images_imports_no_torch(tmp_path: Path) -> None:
+    found = find_torch("main(['check', sys.argv[1]])", render_room(tmp_path / "room", frames=24, size=(160, 120)))
+    assert "off their" in found.stdout, found.stdout + found.stderr
+    assert found.stdout.splitlines()[-1] == "False", found.stderr
+
+
+def test_a_verb_is_imported_without_garbage_collection(monkeypatch: pytest.MonkeyPatch) -> None:
+    collects = []
+
+    def load(name: str) -> SimpleNamespace:
+        collects.append(gc.isenabled())
+        return SimpleNamespace(main=lambda argv: collects.append(gc.isenabled()) or 0)
+
+    monkeypatch.setattr(__main__, "import_module", load)
+    monkeypatch.setattr(gc, "freeze", lambda: None)  # what other tests leave behind is still collected
+    monkeypatch.delitem(sys.modules, "lightning_pose.commands.check", raising=False)
+    assert main(["check", "DIR"]) == 0
+    assert collects == [False, True]
 
 
 def test_a_full_disk_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

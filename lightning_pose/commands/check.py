@@ -61,7 +61,7 @@ def main(argv: list[str]) -> int:
 
 
 def _compare_poses(scene: Scene) -> PoseCheck:
-    from lightning_pose.mapping.pose_check import check_poses  # torch, which takes seconds to import
+    from lightning_pose.mapping.pose_check import check_poses  # not for `--help`
 
     return check_poses(scene)
 

@@ -38,7 +38,7 @@ def essential_matrices(
 
 
 def sampson_distances_px(
-    essential: np.ndarray, points_a_px: np.ndarray, points_b_px: np.ndarray, focal_px: float
+    essential: np.ndarray, points_a_px: np.ndarray, points_b_px: np.ndarray, focal_px: float | np.ndarray
 ) -> np.ndarray:
     """Sampson distances of M matches, in pixels: to first order, how far both points are from a common ray plane.
 
@@ -48,14 +48,18 @@ def sampson_distances_px(
         essential: (M, 3, 3), the essential matrix of each match's pair.
         points_a_px: (M, 2), pixels from the principal point, in the first image.
         points_b_px: (M, 2), in the second image.
-        focal_px: focal length of both cameras.
+        focal_px: focal length of both cameras; or several, (F,), which together take less time than one by one.
 
     Returns:
-        (M,) float64, at least 0; nan where the essential matrix is zero.
+        (M,) float64, at least 0; nan where the essential matrix is zero. (F, M) for several focal lengths.
     """
-    rays_a, rays_b = (np.column_stack([p / focal_px, np.ones(len(p))]) for p in (points_a_px, points_b_px))
-    lines_b = np.einsum("mij,mj->mi", essential, rays_a)
-    lines_a = np.einsum("mij,mi->mj", essential, rays_b)
-    gradient = (lines_a[:, :2] ** 2 + lines_b[:, :2] ** 2).sum(axis=1)
+    (x_a, y_a), (x_b, y_b) = points_a_px.T, points_b_px.T
+    e = np.ascontiguousarray(np.moveaxis(essential, 0, -1))  # (3, 3, M)
+    f = np.asarray(focal_px, np.float64)[..., None]
+    # Lines are linear in 1 / f: the rays are (x / f, y / f, 1).
+    line_b_x, line_b_y, line_b_w = ((e[i, 0] * x_a + e[i, 1] * y_a) / f + e[i, 2] for i in range(3))
+    line_a_x, line_a_y = ((e[0, i] * x_b + e[1, i] * y_b) / f + e[2, i] for i in range(2))
+    product = (x_b * line_b_x + y_b * line_b_y) / f + line_b_w
+    gradient = line_a_x**2 + line_a_y**2 + line_b_x**2 + line_b_y**2
     with np.errstate(divide="ignore", invalid="ignore"):
-        return focal_px * np.abs((rays_b * lines_b).sum(axis=1)) / np.sqrt(gradient)
+        return f * np.abs(product) / np.sqrt(gradient)

@@ -141,22 +141,17 @@ def fit_focal_length(
     a, b = matches.frame_a, matches.frame_b
     essential = essential_matrices(rotation[a], position[a], rotation[b], position[b])[matches.pair]
 
-    def measure(focal_px: float) -> np.ndarray:
-        distance = sampson_distances_px(essential, matches.points_a_px, matches.points_b_px, focal_px)
-        return distance[np.isfinite(distance)]
-
-    def cost(focal_px: float) -> float:
-        distance = measure(focal_px)
-        return float(np.log1p((distance / OUTLIER_PX) ** 2).mean()) if len(distance) else np.nan
-
     low, high = (width_px * bound for bound in FOCAL_RANGE)
     for steps in (FOCAL_STEPS, *[7] * (rounds - 1)):
         tried = np.geomspace(low, high, steps)
-        costs = [cost(focal_px) for focal_px in tried]
+        distance = sampson_distances_px(essential, matches.points_a_px, matches.points_b_px, tried)
+        distance = distance[:, np.isfinite(distance).all(axis=0)]
+        if not distance.size:
+            return np.nan, np.nan, float(low)
+        costs = np.log1p((distance / OUTLIER_PX) ** 2).mean(axis=1)
         best = int(np.argmin(costs))
         low, high = tried[max(best - 1, 0)], tried[min(best + 1, steps - 1)]
-    distance = measure(tried[best])
-    return costs[best], float(np.median(distance)) if len(distance) else np.nan, float(tried[best])
+    return float(costs[best]), float(np.median(distance[best])), float(tried[best])
 
 
 def _name_readings() -> Iterator[tuple[str, tuple[str, str, str]]]:

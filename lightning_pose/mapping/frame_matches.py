@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from threading import Lock
 
 import numpy as np
 
@@ -52,7 +54,7 @@ Keypoints = tuple[np.ndarray, np.ndarray]
 
 
 def match_nearby_frames(
-    sequence: Sequence[str], read_keypoints: Callable[[int], Keypoints], anchors: int = ANCHORS
+    sequence: Sequence[str], read_keypoints: Callable[[int], Keypoints], anchors: int = ANCHORS, threads: int = 1
 ) -> FrameMatches:
     """Match frames 1, 2, 4, 8 ... places apart, as far as they still share enough of what they see.
 
@@ -60,33 +62,39 @@ def match_nearby_frames(
 
     Args:
         sequence: which sequence each frame belongs to; frames of one sequence are consecutive and in order.
-        read_keypoints: a frame's number to its keypoints; called once for each frame that is needed.
+        read_keypoints: a frame's number to its keypoints; called once for each frame that is needed, in any order.
         anchors: how many frames to start from.
+        threads: how many of these are worked on at once; the result is the same.
     """
+    frames = len(sequence)
     known: dict[int, Keypoints] = {}
+    locks = [Lock() for _ in range(frames)]
 
     def look_up(frame: int) -> Keypoints:
-        if frame not in known:
-            known[frame] = read_keypoints(frame)
-        return known[frame]
+        with locks[frame]:
+            if frame not in known:
+                known[frame] = read_keypoints(frame)
+            return known[frame]
 
-    pairs: list[tuple[int, int]] = []
-    points: list[tuple[np.ndarray, np.ndarray]] = [(np.zeros((0, 2)), np.zeros((0, 2)))]
-    frames = len(sequence)
-    for a in np.unique(np.linspace(0, frames - 1, anchors).round().astype(int)).tolist():
-        gap = 1
+    def match_from(a: int) -> list[tuple[int, np.ndarray, np.ndarray]]:
+        """Later frames with matched points of both; each pair of frames moves."""
+        found, gap = [], 1
         while a + gap < frames and sequence[a + gap] == sequence[a]:
             matched = _match_keypoints(look_up(a), look_up(a + gap))
             if matched is None:
                 break
             if np.median(np.linalg.norm(matched[0] - matched[1], axis=1)) >= MIN_MOTION_PX:
-                pairs.append((a, a + gap))
-                points.append(matched)
+                found.append((a + gap, *matched))
             gap *= 2
-    frame_a, frame_b = np.array(pairs, np.int64).reshape(-1, 2).T
-    pair = np.repeat(np.arange(len(points)) - 1, [len(matched[0]) for matched in points])
-    points_a_px, points_b_px = (np.concatenate(side) for side in zip(*points, strict=True))
-    return FrameMatches(frame_a, frame_b, pair, points_a_px, points_b_px)
+        return found
+
+    starts = np.unique(np.linspace(0, frames - 1, anchors).round().astype(int)).tolist()
+    with ThreadPoolExecutor(threads) as pool:
+        found = [(a, *pair) for a, pairs in zip(starts, pool.map(match_from, starts), strict=True) for pair in pairs]
+    pairs, nothing = np.array([each[:2] for each in found], np.int64).reshape(-1, 2), np.zeros((0, 2))
+    points_a_px, points_b_px = (np.concatenate([nothing, *(each[side] for each in found)]) for side in (2, 3))
+    pair = np.repeat(np.arange(len(found)), [len(each[2]) for each in found])
+    return FrameMatches(pairs[:, 0], pairs[:, 1], pair, points_a_px, points_b_px)
 
 
 def _match_keypoints(a: Keypoints, b: Keypoints) -> tuple[np.ndarray, np.ndarray] | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field
 
 import cv2
@@ -9,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lightning_pose.errors import ImageError
-from lightning_pose.features.surf import SURF
+from lightning_pose.features.surf.numpy_surf import extract_surf
 from lightning_pose.geometry.camera import Camera
 from lightning_pose.geometry.triangulation import find_two_view_depths
 from lightning_pose.mapping.clock_offset import MAX_OFFSET_S, STEP_S, fit_clock_offset
@@ -22,6 +23,9 @@ __all__ = ["PoseCheck", "check_poses"]
 
 LONGEST_PX = 960
 """Larger images are shrunk to this before features are extracted."""
+
+MOST_FEATURES = 300
+"""SURF keypoints of an image, the strongest."""
 
 MIN_PAIRS = 10
 """Fewer pairs of frames with a baseline prove nothing."""
@@ -84,10 +88,8 @@ def check_poses(scene: Scene) -> PoseCheck:
     Args:
         scene: the dataset, as it was read.
     """
-    extractor, found = SURF(300), PoseCheck()
-    scales: list[float] = []
-    sizes: list[tuple[int, int]] = []
-    counts: list[int] = []
+    found = PoseCheck()
+    looked_at: dict[int, tuple[int, tuple[int, int], float]] = {}  # frame: keypoints, size, and how much it was shrunk
 
     def read_keypoints(frame: int) -> tuple[np.ndarray, np.ndarray]:
         try:
@@ -98,17 +100,15 @@ def check_poses(scene: Scene) -> PoseCheck:
         scale = min(1.0, LONGEST_PX / max(size))
         if scale < 1:
             image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        (record,) = extractor.extract([image])
-        count = int(record["count"])
-        scales.append(scale)
-        sizes.append(size)
-        counts.append(min(count, 300))
-        pixels = (record["keypoints"][:count, :2] + 0.5) / scale - 0.5
+        keypoints, descriptors = extract_surf(image, MOST_FEATURES, upright=True, threshold=0.0)  # torch takes seconds
+        looked_at[frame] = len(keypoints), size, scale
+        pixels = (keypoints[:, :2] + 0.5) / scale - 0.5
         points = _undistort_points(pixels, scene.frames[frame].intrinsics, *size) * scale
-        return points, record["descriptors"][:count]
+        return points, descriptors
 
-    matches = match_nearby_frames([frame.sequence for frame in scene.frames], read_keypoints)
-    _judge_features(found, counts)
+    sequences = [frame.sequence for frame in scene.frames]
+    matches = match_nearby_frames(sequences, read_keypoints, threads=os.cpu_count() or 1)
+    _judge_features(found, [count for count, _, _ in looked_at.values()])
     quats = np.array([frame.quat_wxyz for frame in scene.frames])
     rotation = Rotation.from_quat(quats, scalar_first=True).as_matrix()
     position = np.array([frame.position_m for frame in scene.frames])
@@ -116,13 +116,13 @@ def check_poses(scene: Scene) -> PoseCheck:
     if moved.sum() < MIN_PAIRS:
         found.facts["poses and images"] = f"not compared: only {moved.sum()} pairs of frames match and move"
         return found
-    found.readings = rank_readings(
-        matches, rotation, position, max(sizes[0]) * scales[0], scene.format in WORLD_TO_CAMERA_FORMATS
-    )
-    _judge_readings(found, scales[0], len(matches.pair), FITS * max(sizes[0]) * scales[0])
-    _judge_focal_length(found, scene, sizes[0])
-    _judge_clock(found, scene, matches, scales[0], FITS * max(sizes[0]) * scales[0])
-    _judge_depth(found, scene, matches, rotation, position, found.focal_px * scales[0])
+    _, size, scale = looked_at[min(looked_at)]
+    width_px = max(size) * scale
+    found.readings = rank_readings(matches, rotation, position, width_px, scene.format in WORLD_TO_CAMERA_FORMATS)
+    _judge_readings(found, scale, len(matches.pair), FITS * width_px)
+    _judge_focal_length(found, scene, size)
+    _judge_clock(found, scene, matches, scale, FITS * width_px)
+    _judge_depth(found, scene, matches, rotation, position, found.focal_px * scale)
     return found
 
 
@@ -140,7 +140,8 @@ def _judge_features(found: PoseCheck, counts: list[int]) -> None:
     if not counts:
         return
     found.facts["features per frame"] = (
-        f"median {np.median(counts):.0f}, least {min(counts)}, of at most 300 SURF keypoints ({len(counts)} frames)"
+        f"median {np.median(counts):.0f}, least {min(counts)}, of at most {MOST_FEATURES} SURF keypoints "
+        f"({len(counts)} frames)"
     )
     few = sum(count < FEW_FEATURES for count in counts)
     if few:

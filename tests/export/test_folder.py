@@ -317,10 +317,12 @@ def test_a_folder_names_its_own_files_only(copied: Path, name: str) -> None:
         ExportedSystem(copied)
 
 
-def test_loading_a_folder_imports_no_torch(folder: Path) -> None:
+def test_locating_with_a_folder_imports_no_torch(folder: Path, mapped_room: MappedRoom) -> None:
     code = (
-        f"import sys; from lightning_pose import Localizer; Localizer.load({str(folder)!r})\n"
+        "import sys; from lightning_pose.__main__ import main; main(['localize', *sys.argv[1:]])\n"
         "print([name for name in ('torch', 'lightning') if name in sys.modules])"
     )
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert found.stdout == "[]\n", found.stderr
+    command = [sys.executable, "-c", code, folder, mapped_room.images[0]]
+    found = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert found.stdout.splitlines()[-1] == "[]", found.stderr
+    assert "1 of 1 images located" in found.stderr

@@ -50,3 +50,13 @@ def test_cameras_in_one_place_have_no_epipolar_lines() -> None:
     essential = essential_matrices(eye, np.ones((1, 3)), eye, np.ones((1, 3)))
     assert not essential.any()
     assert np.isnan(sampson_distances_px(essential, np.zeros((1, 2)), np.ones((1, 2)), FOCAL_PX)).all()
+
+
+def test_several_focal_lengths_are_measured_as_one_by_one() -> None:
+    essential, a_px, b_px = make_two_views()
+    essential, focal_px = np.repeat(essential, 40, 0), np.array([300.0, FOCAL_PX, 900])
+    together = sampson_distances_px(essential, a_px, b_px, focal_px)
+    assert together.shape == (3, 40)
+    assert np.median(together[0]) > 1
+    for focal, distances in zip(focal_px, together, strict=True):
+        np.testing.assert_array_equal(distances, sampson_distances_px(essential, a_px, b_px, focal))

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from lightning_pose.errors import ConfigError
-from lightning_pose.export.runner.surf import extract_surf
+from lightning_pose.features.surf.numpy_surf import extract_surf
 from lightning_pose.geometry.camera import Camera
 from lightning_pose.mapping.frames import MapQuery
 

@@ -12,7 +12,7 @@ from lightning import LightningModule
 from lightning_pose.checkpoint import Spec, class_path, resolve_class_path
 from lightning_pose.data.datamodule import SceneDataModule, find_datamodule
 from lightning_pose.errors import CheckpointError
-from lightning_pose.scenes.scene import Frame
+from lightning_pose.scenes.scene import Frame, Scene
 
 __all__ = ["LEARNT_FRAMES", "CheckpointHooks", "key_frame"]
 
@@ -28,6 +28,8 @@ def key_frame(frame: Frame) -> int:
 
 class CheckpointHooks(LightningModule):
     """Mixin of `PoseModule`: adds specs of the module and its data to its checkpoints, and checks those it loads."""
+
+    _learnt: tuple[Scene, torch.Tensor] | None = None
 
     @property
     def training_splits(self) -> tuple[str, ...]:
@@ -70,7 +72,10 @@ class CheckpointHooks(LightningModule):
             checkpoint[LEARNT_FRAMES] = self._list_learnt_frames(datamodule)
 
     def _list_learnt_frames(self, datamodule: SceneDataModule) -> torch.Tensor:
-        """(M,) int64, the keys of the frames of `training_splits`."""
+        """(M,) int64, the keys of the frames of `training_splits`; two checkpoints an epoch need them."""
         scene = datamodule.scene
-        rows = [int(i) for split in self.training_splits for i in scene.splits[split]]
-        return torch.tensor(sorted(key_frame(scene.frames[i]) for i in rows), dtype=torch.int64)
+        if self._learnt is None or self._learnt[0] is not scene:
+            rows = [int(i) for split in self.training_splits for i in scene.splits[split]]
+            keys = sorted(key_frame(scene.frames[i]) for i in rows)
+            self._learnt = scene, torch.tensor(keys, dtype=torch.int64)
+        return self._learnt[1]

@@ -1,12 +1,12 @@
-"""SURF in numpy, as exported folders have it, against SURF in torch."""
+"""SURF in numpy, which exported folders and `check` use, against SURF in torch."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from lightning_pose.export.runner.surf import extract_surf
 from lightning_pose.features import SURF
+from lightning_pose.features.surf.numpy_surf import extract_surf
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,6 @@
-"""SURF in numpy: what `features/surf` computes in torch, for one image at a time.
+"""SURF in numpy, for one image at a time, where torch is missing or takes longer to import than the work.
+
+The same features as `extractor` computes in torch, up to rounding.
 
 Bay, Ess, Tuytelaars, Van Gool: "Speeded-Up Robust Features", 2008, with OpenCV's filters, borders and rounding:
 4 octaves of 5 layers, octave o sampled every 2**o pixels.
