@@ -174,7 +174,7 @@ class LastCheckpoint(_RunCheckpoint):
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         # A checkpoint's epoch counts as completed once training has gone on; here nothing may have been left of it.
         epochs = trainer.fit_loop.epoch_progress.current
-        epochs.completed = epochs.processed
+        epochs.completed = epochs.state_dict()["processed"]  # an attribute, but not of its declared type
 
     def _log_missing(self, trainer: Trainer) -> None:
         """Log the training metrics of the checkpoint's epoch if the run lacks them.
