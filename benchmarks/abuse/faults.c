@@ -4,6 +4,7 @@
 #include <errno.h>
 #include <fcntl.h>
 #include <limits.h>
+#include <signal.h>
 #include <stdarg.h>
 #include <stdatomic.h>
 #include <stdio.h>
@@ -17,7 +18,8 @@ static atomic_long count;
 static long first, last;
 static int number;
 
-/* Let operations `from` to `to`, counted from 1, on files below `folder` fail with this error; 0 lets none fail. */
+/* Let operations `from` to `to`, counted from 1, on files below `folder` fail with this error; 0 lets none fail.
+   An error below 0 is a signal that the process gets then. */
 void fault_arm(const char *folder, long from, long to, int error) {
   strncpy(prefix, folder, sizeof prefix - 1);
   count = 0;
@@ -39,6 +41,7 @@ static int path_fails(const char *path) {
   if (strncmp(path, prefix, strlen(prefix)) != 0) return 0;
   long at = ++count;
   if (at < first || at > last) return 0;
+  if (number < 0) kill(getpid(), -number);
   errno = number;
   return 1;
 }

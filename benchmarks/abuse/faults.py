@@ -8,26 +8,22 @@ from __future__ import annotations
 import ctypes
 import errno
 import os
-import sqlite3
 import subprocess
 import sys
-import threading
-import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import closing
 from pathlib import Path
 
 from benchmarks.abuse.signals import list_torn
+from benchmarks.abuse.stores import try_stores
 from benchmarks.abuse.table import Row
 from benchmarks.abuse.workplace import Ended, Workplace, run_command
 from tests.processes import ForkedProcess
 
-__all__ = ["break_disks"]
+__all__ = ["break_disks", "preload_faults", "run_faulty"]
 
 SOURCE = Path(__file__).parent / "faults.c"
 
-LOCKED_SECONDS = 60
 ALL = 1 << 60
 
 
@@ -38,9 +34,7 @@ def break_disks(base: Workplace, times: int | None) -> Iterator[Row]:
         base: a workplace.
         times: at how many operations of each command, spread over all of them; 30 by default.
     """
-    library = base.folder.parent / "faults.so"
-    subprocess.run(["gcc", "-shared", "-fPIC", "-O1", "-o", library, SOURCE, "-ldl"], check=True)
-    os.environ["LD_PRELOAD"] = str(library)  # the server that processes are forked off starts with it
+    library = preload_faults(base.folder.parent)
     count = 30 if times is None else times
     config = base.config("refined")
     assert base.run("fit", "--config", config).code == 0
@@ -50,12 +44,26 @@ def break_disks(base: Workplace, times: int | None) -> Iterator[Row]:
         "fit": ("fit", "--config", config),
         "export": ("export", best, "--out", "exported"),
     }
-    for name, words in commands.items():
+    for name, words in ((name, words) for name, words in commands.items() if base.wants(name)):
         disk = Disk(base, library, words, empty=name == "extract")
         for text, number, lasts in (("disk full", errno.ENOSPC, True), ("one EIO", errno.EIO, False)):
             yield disk.try_all(f"{text} in `{name}`", number, lasts, count)
-    yield _try_home(base, library, config)
-    yield from _lock_store(base, config)
+    if base.wants("home"):
+        yield _try_home(base, library, config)
+    yield from try_stores(base)
+
+
+def preload_faults(folder: Path) -> Path:
+    """Compile `faults.c` into a folder, and let the server that processes are forked off begin with it; its file.
+
+    It is called before the first process is forked, as the server begins then.
+    """
+    if "LD_PRELOAD" in os.environ:
+        return Path(os.environ["LD_PRELOAD"])
+    library = folder / "faults.so"
+    subprocess.run(["gcc", "-shared", "-fPIC", "-O1", "-o", library, SOURCE, "-ldl"], check=True)
+    os.environ["LD_PRELOAD"] = str(library)
+    return library
 
 
 class Disk:
@@ -146,30 +154,3 @@ def _try_home(base: Workplace, library: Path, config: Path) -> Row:
         found["one line" if ended.is_clean and ended.code else f"exit code {ended.code}"] += 1
     bad = {kind: times for kind, times in found.items() if kind != "one line"}
     return Row("read-only home in `extract` and `fit`", 2, bad, f"{found['one line']} one line")
-
-
-def _lock_store(base: Workplace, config: Path) -> Iterator[Row]:
-    """Lock the store for a minute: before `fit` begins, while it trains, and at its end."""
-    found: Counter[str] = Counter()
-    for delay in (0.0, 2.0, 5.0):
-        place = base.copy()
-        with place.fork("fit", "--config", config, "--trainer.max_epochs", 30) as process:
-            time.sleep(delay)
-            locker = threading.Thread(target=_hold_lock, args=(place.folder / "mlruns" / "mlflow.db",))
-            locker.start()
-            _, errors = process.communicate(400)
-            code = process.wait()
-            locker.join()
-        runs = place.runs()
-        whole = code == 0 and len(runs) == 1 and runs[0].info.status == "FINISHED" and "Traceback" not in errors
-        whole = whole and "test/position_median_m" in runs[0].data.metrics
-        found["complete" if whole else f"exit code {code}, {[run.info.status for run in runs]}"] += 1
-    bad = {kind: times for kind, times in found.items() if kind != "complete"}
-    yield Row(f"store locked for {LOCKED_SECONDS} s in `fit`", 3, bad, f"{found['complete']} complete")
-
-
-def _hold_lock(file: Path) -> None:
-    with closing(sqlite3.connect(file, timeout=30, isolation_level=None)) as connection:
-        connection.execute("BEGIN EXCLUSIVE")
-        time.sleep(LOCKED_SECONDS)
-        connection.execute("COMMIT")

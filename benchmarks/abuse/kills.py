@@ -20,7 +20,7 @@ from benchmarks.abuse.workplace import Workplace
 from lightning_pose.features.record_files import read_record
 from tests.processes import ForkedProcess
 
-__all__ = ["kill_commands", "kill_fits"]
+__all__ = ["GOOD", "kill_commands", "kill_fits", "read_result", "resume_fit"]
 
 GOOD = ("same as uninterrupted", "begun anew", "had ended")
 
@@ -34,7 +34,7 @@ def kill_fits(base: Workplace, times: int | None) -> Iterator[Row]:
         base: a workplace.
         times: how often each, 30 by default.
     """
-    for system in ("SurfLSTM", "CNNRNN", "NodePose", "LandmarkMap"):
+    for system in filter(base.wants, ("SurfLSTM", "CNNRNN", "NodePose", "LandmarkMap")):
         words = ("fit", "--config", base.config(system))
         assert base.run(*words).code == 0
         seconds, place = _measure_seconds(base, words)
@@ -85,6 +85,11 @@ def _kill_fit(base: Workplace, words: Sequence[object], seconds: float, expected
         _watch(process, seconds)
         process.kill()
         ended = process.wait() == 0
+    return resume_fit(place, words, ended, expected)
+
+
+def resume_fit(place: Workplace, words: Sequence[object], ended: bool, expected: Result) -> str:
+    """Let a run go on that was killed, unless it `ended`, and compare it with the uninterrupted one."""
     resumed = place.complete(*words, "--ckpt_path", "last")
     anew = resumed.code == 2 and "no run of" in resumed.stderr
     if anew:
@@ -112,7 +117,7 @@ def kill_commands(base: Workplace, times: int | None) -> Iterator[Row]:
 
     Args:
         base: a workplace.
-        times: how often each, 30 by default; `reconstruct` a sixth of that.
+        times: how often each, 30 by default.
     """
     count = 30 if times is None else times
     config = base.config("refined")
@@ -131,13 +136,16 @@ def kill_commands(base: Workplace, times: int | None) -> Iterator[Row]:
     def check_scene(place: Workplace) -> bool:
         return place.complete("check", "scene").code == 0
 
-    yield _kill_command(base, ("extract", "--config", config), 2, count, check_cache, ())
-    yield _kill_command(base, ("export", best, "--out", "exported"), 1, count, check_folder, ("--overwrite",))
+    if base.wants("extract"):
+        yield _kill_command(base, ("extract", "--config", config), 2, count, check_cache, ())
+    if base.wants("export"):
+        yield _kill_command(base, ("export", best, "--out", "exported"), 1, count, check_folder, ("--overwrite",))
     images = base.folder / "images"
     images.mkdir()
     for image in sorted((base.room / "seq-01").glob("*.png")):
         shutil.copy(image, images)
-    yield _kill_command(base, ("reconstruct", images, "scene"), 1, max(1, count // 6), check_scene, ())
+    if base.wants("reconstruct"):
+        yield _kill_command(base, ("reconstruct", images, "scene"), 1, count, check_scene, ())
 
 
 def _read_records(cache: Path) -> Mapping[str, bytes]:

@@ -22,7 +22,7 @@ def compare_threads(base: Workplace, times: int | None) -> Iterator[Row]:
         base: a workplace.
         times: not used.
     """
-    for system in SYSTEMS:
+    for system in filter(base.wants, SYSTEMS):
         config = base.config(system)
         results = []
         for threads in ("1", "1", "2"):

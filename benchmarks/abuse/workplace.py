@@ -10,7 +10,7 @@ import os
 import shutil
 import signal
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -73,10 +73,16 @@ class Workplace:
     Attributes:
         folder: current folder of the commands.
         room: the scene.
+        only: names of the cases that are asked for; all if there are none.
     """
 
     folder: Path
     room: Path
+    only: tuple[str, ...] = ()
+
+    def wants(self, case: str) -> bool:
+        """Whether a case is asked for."""
+        return not self.only or case in self.only
 
     @property
     def uri(self) -> str:
@@ -156,7 +162,7 @@ def run_command(words: list[str]) -> int:
     return main(words)
 
 
-def make_workplace(folder: Path) -> Workplace:
+def make_workplace(folder: Path, only: Sequence[str] = ()) -> Workplace:
     """A workplace in this folder, which is emptied, and its room."""
     for noisy in ("alembic", "mlflow", "lightning_pose"):
         logging.getLogger(noisy).setLevel(logging.ERROR)
@@ -165,4 +171,4 @@ def make_workplace(folder: Path) -> Workplace:
     (folder / "mlruns").mkdir(parents=True)
     MlflowClient(f"sqlite:///{folder / 'empty.db'}").search_experiments()  # making one takes seconds
     shutil.copy(folder / "empty.db", folder / "mlruns" / "mlflow.db")
-    return Workplace(folder, render_room(folder / "room", frames=60, size=(320, 240)))
+    return Workplace(folder, render_room(folder / "room", frames=60, size=(320, 240)), tuple(only))

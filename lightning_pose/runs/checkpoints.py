@@ -149,7 +149,10 @@ class LastCheckpoint(_RunCheckpoint):
         self._stopped = trainer.should_stop and not (timer is not None and (timer.time_remaining() or 1) <= 0)
         self._settings = {"seed_everything": read_seed(), "trainer.precision": str(trainer.precision)}
         measured = {name: float(v) for name, v in trainer.callback_metrics.items() if name.startswith("train/")}
-        self._logged = {"step": trainer.global_step - 1, "metrics": measured}
+        # Lightning logs by batches, of which a closed form has many for its one step; it adds the epoch's number.
+        batches = trainer.fit_loop.epoch_loop.batch_progress.total.ready
+        steps = trainer.global_step if pl_module.automatic_optimization else batches
+        self._logged = {"step": steps - 1, "metrics": {**measured, "epoch": float(trainer.current_epoch)}}
         super().on_train_epoch_end(trainer, pl_module)
 
     def state_dict(self) -> dict[str, Any]:
@@ -167,6 +170,11 @@ class LastCheckpoint(_RunCheckpoint):
         self._log_missing(trainer)
         if self.finishes and self._stopped:
             trainer.should_stop = True
+
+    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        # A checkpoint's epoch counts as completed once training has gone on; here nothing may have been left of it.
+        epochs = trainer.fit_loop.epoch_progress.current
+        epochs.completed = epochs.state_dict()["processed"]  # an attribute, but not of its declared type
 
     def _log_missing(self, trainer: Trainer) -> None:
         """Log the training metrics of the checkpoint's epoch if the run lacks them.

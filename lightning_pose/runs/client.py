@@ -7,6 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from functools import partial
+from typing import TypeVar
 
 from mlflow import MlflowClient
 from mlflow.entities import Param, Run, RunData, RunTag
@@ -15,7 +16,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from lightning_pose.runs.reader import mask_passwords
 
-__all__ = ["BufferedClient", "is_unreachable"]
+__all__ = ["BufferedClient", "is_unreachable", "wait_while_locked"]
 
 WRITES = (
     "log_artifact",
@@ -29,6 +30,9 @@ WRITES = (
     "update_run",
 )
 """Methods of `MlflowClient` that are tried again later."""
+
+READS = ("get_experiment_by_name", "get_metric_history", "search_runs")
+"""Methods of `MlflowClient` that wait while another process has locked the store."""
 
 REFUSALS = {
     "ALREADY_EXISTS",
@@ -44,12 +48,22 @@ REFUSALS = {
 WAIT_SECONDS = 5.0
 """The shortest time between two attempts to reach a store that is gone."""
 
+GONE_SECONDS = 10.0
+"""How long a command waits for a server at its end."""
+
 SHARE = 10
 """So many times as long as the last attempt took is the time until the next one: a tenth of training at the most."""
+
+LOCKED_SECONDS = 60.0
+"""How long another process may lock an SQLite store; MLflow itself waits 20 seconds."""
+
+LOCKED_PAUSE_SECONDS = 0.2
+"""Time between two attempts to use a store that is locked."""
 
 log = logging.getLogger("lightning_pose")
 
 Write = Callable[[], object]
+T = TypeVar("T")
 
 
 class BufferedClient(MlflowClient):
@@ -74,6 +88,8 @@ class BufferedClient(MlflowClient):
         for name in WRITES:
             # As attributes of the object, in place of nine methods with the signatures of MLflow's.
             setattr(self, name, partial(self._write, name, getattr(self, name)))
+        for name in READS:
+            setattr(self, name, partial(self._read, getattr(self, name)))
 
     def attempt(self, write: Write) -> None:
         """Do something that writes to the store; keep it for later while the store is gone."""
@@ -85,9 +101,10 @@ class BufferedClient(MlflowClient):
         if self._pending or not self._try(write):
             self._pending.append(write)
 
-    def finish(self, seconds: float = 10.0) -> None:
+    def finish(self) -> None:
         """Send what is kept; wait for the store, and say what is missing there if it does not come back."""
-        deadline = time.monotonic() + seconds
+        # A database on this machine that does not answer is locked, and no process should do that for long.
+        deadline = time.monotonic() + (LOCKED_SECONDS if self._uri.startswith("sqlite:") else GONE_SECONDS)
         while self._pending and not self._send_pending() and time.monotonic() < deadline:
             time.sleep(1.0)
         missing = len(self._pending) + self._lost
@@ -105,7 +122,8 @@ class BufferedClient(MlflowClient):
         if known is not None and self._pending and time.monotonic() < self._next_attempt:
             return known
         try:
-            self._runs[run_id] = super().get_run(run_id)
+            read = partial(super().get_run, run_id)
+            self._runs[run_id] = read() if known is not None else wait_while_locked(read)
         except (MlflowException, SQLAlchemyError, OSError) as error:
             if known is None or not is_unreachable(error):
                 raise
@@ -116,6 +134,11 @@ class BufferedClient(MlflowClient):
         if not self._is_writing:
             self._remember(name, run_id, args, kwargs)
         self.attempt(partial(method, run_id, *args, **kwargs))
+
+    @staticmethod
+    def _read(method: Callable[..., object], /, *args: object, **kwargs: object) -> object:
+        """Call one of `READS`."""
+        return wait_while_locked(partial(method, *args, **kwargs))
 
     def _remember(self, name: str, run_id: str, args: tuple[object, ...], kwargs: dict[str, object]) -> None:
         """Note in the run as it was read last what is written to it."""
@@ -170,6 +193,18 @@ class BufferedClient(MlflowClient):
         if not self._lost:
             self._gone_since = ""
         return True
+
+
+def wait_while_locked(ask: Callable[[], T]) -> T:
+    """What a store answers; it is asked again while another process has locked it, for `LOCKED_SECONDS` at most."""
+    deadline = time.monotonic() + LOCKED_SECONDS
+    while True:
+        try:
+            return ask()
+        except (MlflowException, SQLAlchemyError) as error:
+            if "database is locked" not in str(error) or time.monotonic() >= deadline:
+                raise
+        time.sleep(LOCKED_PAUSE_SECONDS)
 
 
 def is_unreachable(error: Exception) -> bool:

@@ -21,7 +21,7 @@ from lightning.pytorch.loggers import MLFlowLogger
 from lightning_pose.checkpoint import find_class_paths, read_checkpoint
 from lightning_pose.errors import CheckpointError, ConfigError, ImageError
 from lightning_pose.paths import STORE_VARIABLE, default_tracking_uri
-from lightning_pose.runs.client import BufferedClient, is_unreachable
+from lightning_pose.runs.client import BufferedClient, is_unreachable, wait_while_locked
 from lightning_pose.runs.process import has_owner_died, process_tags
 from lightning_pose.runs.reader import mask_passwords, read_pages
 from lightning_pose.runs.signals import delay_interrupts
@@ -118,28 +118,30 @@ class MLflowLogger(MLFlowLogger):
             ConfigError: the store is gone before there is a run.
         """
         if not self._opened:
-            # The run that it creates has to be closed; a server may take minutes not to answer.
-            with _keep_environment(), delay_interrupts() if sqlite_file(self.uri) else nullcontext():
-                self._open_run()
-                self._opened = True
+            from mlflow.exceptions import MlflowException
+
+            try:
+                wait_while_locked(self._open_run)
+            except MlflowException as error:
+                if not is_unreachable(error):
+                    raise
+                reason = mask_passwords(str(error).strip().partition("\n")[0])[:200]
+                raise ConfigError(f"the MLflow store {mask_passwords(self.uri)} takes no run ({reason})") from error
         return self._writer
 
     def _open_run(self) -> None:
         """Find or create the experiment and the run."""
         from mlflow.exceptions import MlflowException
 
-        try:
+        # The run that it creates has to be closed; a server may take minutes not to answer.
+        with _keep_environment(), delay_interrupts() if sqlite_file(self.uri) else nullcontext():
             try:
                 _ = super().experiment
             except MlflowException as error:
                 if error.error_code != "RESOURCE_ALREADY_EXISTS":
                     raise
                 _ = super().experiment  # another process has created the experiment at the same time
-        except MlflowException as error:
-            if not is_unreachable(error):
-                raise
-            reason = mask_passwords(str(error).strip().partition("\n")[0])[:200]
-            raise ConfigError(f"the MLflow store {mask_passwords(self.uri)} takes no run ({reason})") from error
+            self._opened = True
 
     @property
     def client(self) -> BufferedClient:
@@ -231,9 +233,7 @@ def find_last_run(
     Raises:
         CheckpointError: there is no such run.
     """
-    from mlflow import MlflowClient
-
-    client = MlflowClient(prepare_store(uri))
+    client = BufferedClient(prepare_store(uri))
     experiment = client.get_experiment_by_name(experiment_name)
     ids = [experiment.experiment_id] if experiment else []
     query = f"tags.architecture = '{architecture}'"

@@ -9,6 +9,7 @@ from typing import Any
 
 from lightning_pose.checkpoint import Spec, read_checkpoint
 from lightning_pose.errors import CheckpointError, ConfigError
+from lightning_pose.runs.client import BufferedClient
 from lightning_pose.runs.logger import flatten_settings
 from lightning_pose.runs.tags import OPERATIONAL
 
@@ -88,9 +89,7 @@ def check_same_settings(checkpoint: str, model: Spec, data: Spec, seed: int | No
 
 def is_complete(uri: str, run_id: str) -> bool:
     """Whether an MLflow run has ended with the results of its test."""
-    from mlflow import MlflowClient
-
-    run = MlflowClient(uri).get_run(run_id)
+    run = BufferedClient(uri).get_run(run_id)
     return run.info.status == "FINISHED" and any(name.startswith("test/") for name in run.data.metrics)
 
 

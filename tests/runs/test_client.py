@@ -11,7 +11,9 @@ import pytest
 from mlflow import MlflowClient
 from mlflow.entities import Metric, Param
 from mlflow.exceptions import MlflowException
+from mlflow.protos.databricks_pb2 import TEMPORARILY_UNAVAILABLE
 
+from lightning_pose.errors import ConfigError
 from lightning_pose.runs import client as client_module
 from lightning_pose.runs.client import BufferedClient
 from lightning_pose.runs.logger import MLflowLogger
@@ -77,11 +79,14 @@ def test_what_the_store_did_not_take_is_sent_in_order(
     assert "answers again; 6 entries that were kept are sent" in back
 
 
-def test_a_gap_is_said(logger: MLflowLogger, outage: Outage, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_gap_is_said(
+    logger: MLflowLogger, outage: Outage, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
     client = logger.client
     outage.on = True
     logger.log_metrics({"val/loss": 1.0})
-    client.finish(seconds=0)
+    monkeypatch.setattr(client_module, "LOCKED_SECONDS", 0.0)
+    client.finish()
     assert "1 entries (metrics, parameters, files) since" in caplog.text
 
 
@@ -94,6 +99,55 @@ def test_a_store_that_is_gone_is_not_asked_all_the_time(
     for epoch in range(100):
         logger.log_metrics({"val/loss": 1.0}, step=epoch)
     assert outage.asked == 1
+
+
+def lock(monkeypatch: pytest.MonkeyPatch, name: str, times: int, now: list[float] | None = None) -> None:
+    """Let a method of the store fail so many times as it does when another process has locked the database.
+
+    `now` is a clock, which then goes on by the time that MLflow itself waits.
+    """
+    method, left = getattr(MlflowClient, name), [times]
+
+    def ask(*args: Any, **kwargs: Any) -> Any:
+        if left[0]:
+            left[0] -= 1
+            if now is not None:
+                now[0] += 20
+            raise MlflowException("(sqlite3.OperationalError) database is locked", TEMPORARILY_UNAVAILABLE)
+        return method(*args, **kwargs)
+
+    monkeypatch.setattr(MlflowClient, name, ask)
+
+
+@pytest.mark.parametrize("name", ["create_run", "get_experiment_by_name", "search_runs", "get_run"])
+def test_a_locked_store_is_waited_for(name: str, workplace: Workplace, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(client_module, "LOCKED_PAUSE_SECONDS", 0.0)
+    lock(monkeypatch, name, 3)
+    logger = MLflowLogger(tracking_uri=workplace.uri, root=str(workplace.folder))
+    run = str(logger.run_id)
+    assert logger.client.get_run(run).info.status == "RUNNING"
+    assert logger.client.get_metric_history(run, "train/loss") == []
+    assert [found.info.run_id for found in workplace.runs()] == [run]
+
+
+def test_a_store_that_stays_locked_takes_no_run(workplace: Workplace, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(client_module, "LOCKED_SECONDS", 0.0)
+    lock(monkeypatch, "get_experiment_by_name", 1000)
+    logger = MLflowLogger(tracking_uri=workplace.uri, root=str(workplace.folder))
+    with pytest.raises(ConfigError, match=r"takes no run .*database is locked"):
+        _ = logger.run_id
+
+
+def test_a_run_ends_once_its_store_is_unlocked(workplace: Workplace, monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [0.0]
+    lock(monkeypatch, "set_terminated", 3, now)
+    logger = MLflowLogger(tracking_uri=workplace.uri, root=str(workplace.folder))
+    run, client = str(logger.run_id), logger.client
+    monkeypatch.setattr(client_module.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(client_module.time, "sleep", lambda seconds: None)
+    logger.finalize()
+    monkeypatch.undo()
+    assert client.get_run(run).info.status == "FINISHED"
 
 
 def test_what_is_wrong_with_a_write_is_raised(logger: MLflowLogger) -> None:

@@ -163,3 +163,29 @@ def test_the_metrics_of_the_checkpoint_s_epoch_are_logged(workplace: Workplace) 
     history = workplace.client.get_metric_history(run.info.run_id, "train/loss")
     assert len(steps) == 1
     assert [metric.step for metric in history] == [2, 5, 8]
+
+
+CLOSED_FORM = ["--model", "lightning_pose.models.LinearPoseNet", "--model.lambdas", "[1.0]"]
+CLOSED_FORM += ["--data.extractor", "tests.evaluation.test_unseen.Vectors", "--data.val_fraction", "0"]
+
+
+@pytest.mark.parametrize("stop", ["tests.runs.test_resume.DieUnlogged", "tests.runs.test_resume.FailInTest"])
+def test_a_resumed_closed_form_has_the_metrics_of_the_uninterrupted_one(
+    stop: str, workplace: Workplace, store: Path, tmp_path: Path
+) -> None:
+    # It steps once in an epoch of three batches, and Lightning logs by batches.
+    stop_run(workplace, *CLOSED_FORM, *stop_at(stop, 0))
+    assert workplace.run("fit", *CLOSED_FORM, "--ckpt_path", "last") == 0
+    whole = Workplace.make(tmp_path / "whole", workplace.scene, store)
+    assert whole.run("fit", *CLOSED_FORM) == 0
+    expected = read_history(whole)
+    assert read_history(workplace) == expected
+    assert [step for step, _ in expected["train/loss"]] == [2]  # of batches 0 to 2
+
+
+def read_history(workplace: Workplace) -> dict[str, list[tuple[int, float]]]:
+    """Step and value of all that the only run has logged of each metric but costs."""
+    (run,) = workplace.runs()
+    names = [name for name in run.data.metrics if not name.startswith("cost/")]
+    histories = {name: workplace.client.get_metric_history(run.info.run_id, name) for name in names}
+    return {name: [(metric.step, metric.value) for metric in history] for name, history in histories.items()}
