@@ -12,11 +12,12 @@ from __future__ import annotations
 
 import argparse
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
 import cv2
+import numpy as np
 import torch
 from torch.nn import functional as F
 
@@ -54,7 +55,7 @@ def run_bare(cnn: CNN, network: torch.nn.Module, paths: list[Path]) -> list[torc
     for start in range(0, len(paths), BATCH):
         batch = []
         for path in paths[start : start + BATCH]:
-            image = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)
+            image = np.asarray(cv2.imread(str(path)))[:, :, ::-1].copy()
             height, width = image.shape[:2]
             scale = cnn.short_side / min(height, width)
             rgb = torch.from_numpy(image).permute(2, 0, 1)[None].float() / 255
@@ -77,7 +78,9 @@ def measure(options: Options, frames: int = 96) -> Iterator[Measurement]:
         one, two = "one worker", "two workers"
         found = {}
         for name, extractor in (("SURF, 300 features", surf), ("EfficientNet-Lite0", cnn)):
-            systems = {words: partial(fill_cache, extractor, paths, n) for n, words in ((1, one), (2, two))}
+            systems: dict[str, Callable[[], Seconds]] = {
+                words: partial(fill_cache, extractor, paths, n) for n, words in ((1, one), (2, two))
+            }
             if extractor is cnn:
                 systems["bare"] = lambda: time_work(lambda: run_bare(cnn, network, paths))
             found[name] = interleave(systems, options.rounds or 5)

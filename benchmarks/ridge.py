@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from statistics import median
+from typing import Any
 
 import numpy as np
 import torch
@@ -86,7 +87,8 @@ def normalize(x: np.ndarray) -> np.ndarray:
 def solve_kernel_ridge(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """scikit-learn's answers (100, 7); it has no bias, and gets centred poses."""
     keys, mean = normalize(x), y.mean(0)
-    model = KernelRidge(alpha=KERNEL_LAMBDA, kernel="rbf", gamma=measure_gamma(keys)).fit(keys, y - mean)
+    strength: Any = KERNEL_LAMBDA  # scikit-learn's own types say that it is an int
+    model = KernelRidge(alpha=strength, kernel="rbf", gamma=measure_gamma(keys)).fit(keys, y - mean)
     return model.predict(keys[:100]) + mean
 
 

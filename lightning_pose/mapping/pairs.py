@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from lightning_pose.mapping.frames import MapFrames
 
@@ -80,7 +80,7 @@ def _list_candidates(frames: MapFrames, depth: float) -> Iterator[np.ndarray | s
         yield from repeat(slice(None), len(frames))
         return
     looked_at = frames.position + depth * frames.rotation[:, :, 2]
-    tree = cKDTree(looked_at)
+    tree = KDTree(looked_at)
     for place in looked_at:
         yield np.sort(tree.query(place, MOST_COMPARED)[1])
 

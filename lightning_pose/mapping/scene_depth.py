@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from lightning_pose.mapping.frames import MapFrames
 from lightning_pose.mapping.pairs import MOST_COMPARED, choose_pairs
@@ -52,7 +52,7 @@ def estimate_depth(rotation: np.ndarray, position: np.ndarray) -> float:
     """
     if len(position) > MOST_COMPARED:
         middle = np.linspace(0, len(position) - 1, GROUPS).round().astype(int)
-        _, groups = cKDTree(position).query(position[middle], GROUP)
+        _, groups = KDTree(position).query(position[middle], GROUP)
         return float(np.median([estimate_depth(rotation[group], position[group]) for group in groups]))
     axis = rotation[:, :, 2]
     across = np.eye(3) - axis[:, :, None] * axis[:, None, :]

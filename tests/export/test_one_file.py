@@ -61,8 +61,10 @@ def test_definitions_come_with_what_they_use_and_what_documents_them() -> None:
 
 
 def test_a_package_that_is_not_there_is_named() -> None:
-    with pytest.raises(ValueError, match=r"lightning_pose.models.parts.ridge needs torch, which an exported folder"):
-        join_modules(["lightning_pose.models.parts.ridge.Moments"], {}, "", "")
+    with pytest.raises(
+        ValueError, match=r"lightning_pose.models.parts.neighbour_graph needs torch, which an exported folder"
+    ):
+        join_modules(["lightning_pose.models.parts.neighbour_graph.search_neighbours"], {}, "", "")
     with pytest.raises(ValueError, match="does not define nothing"):
         join_modules(["lightning_pose.errors.nothing"], {}, "", "")
     with pytest.raises(ValueError, match="both define MIN_MATCHES; rename one"):
