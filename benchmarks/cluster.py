@@ -117,7 +117,7 @@ def main() -> None:
 
         def count_records() -> str:
             cache = Path(place.environment["LIGHTNING_POSE_CACHE"])
-            return f"{len([file for file in cache.rglob('*') if file.suffix in ('.npz', '.npy')])} records"
+            return f"{len([file for file in cache.rglob('*') if file.suffix == '.safetensors'])} records"
 
         row = measure(place, extract, count_records, ["--data.workers", 1])
         print(f"| `extract`, {len(images)} images {row}", flush=True)

@@ -52,7 +52,7 @@ def estimate_depth(rotation: np.ndarray, position: np.ndarray) -> float:
     """
     if len(position) > MOST_COMPARED:
         middle = np.linspace(0, len(position) - 1, GROUPS).round().astype(int)
-        _, groups = KDTree(position).query(position[middle], GROUP)
+        groups = np.asarray(KDTree(position).query(position[middle], GROUP)[1])
         return float(np.median([estimate_depth(rotation[group], position[group]) for group in groups]))
     axis = rotation[:, :, 2]
     across = np.eye(3) - axis[:, :, None] * axis[:, None, :]
