@@ -84,6 +84,7 @@ class BufferedClient(MlflowClient):
         self._next_attempt = 0.0
         self._gone_since = ""
         self._is_writing = False
+        self._is_locked = False
         self._runs: dict[str, Run] = {}
         for name in WRITES:
             # As attributes of the object, in place of nine methods with the signatures of MLflow's.
@@ -103,9 +104,10 @@ class BufferedClient(MlflowClient):
 
     def finish(self) -> None:
         """Send what is kept; wait for the store, and say what is missing there if it does not come back."""
-        # A database on this machine that does not answer is locked, and no process should do that for long.
-        deadline = time.monotonic() + (LOCKED_SECONDS if self._uri.startswith("sqlite:") else GONE_SECONDS)
-        while self._pending and not self._send_pending() and time.monotonic() < deadline:
+        began = time.monotonic()
+        while self._pending and not self._send_pending():
+            if time.monotonic() - began >= (LOCKED_SECONDS if self._is_locked else GONE_SECONDS):
+                break
             time.sleep(1.0)
         missing = len(self._pending) + self._lost
         if missing:
@@ -165,6 +167,7 @@ class BufferedClient(MlflowClient):
         except (MlflowException, SQLAlchemyError, OSError) as error:
             if not is_unreachable(error):
                 raise
+            self._is_locked = is_locked(error)
             now = time.monotonic()
             self._next_attempt = now + max(WAIT_SECONDS, SHARE * (now - started))
             if not self._gone_since:
@@ -195,6 +198,11 @@ class BufferedClient(MlflowClient):
         return True
 
 
+def is_locked(error: Exception) -> bool:
+    """Whether a store says that another process has locked it: no process should do that for long."""
+    return "database is locked" in str(error)
+
+
 def wait_while_locked(ask: Callable[[], T]) -> T:
     """What a store answers; it is asked again while another process has locked it, for `LOCKED_SECONDS` at most."""
     deadline = time.monotonic() + LOCKED_SECONDS
@@ -202,7 +210,7 @@ def wait_while_locked(ask: Callable[[], T]) -> T:
         try:
             return ask()
         except (MlflowException, SQLAlchemyError) as error:
-            if "database is locked" not in str(error) or time.monotonic() >= deadline:
+            if not is_locked(error) or time.monotonic() >= deadline:
                 raise
         time.sleep(LOCKED_PAUSE_SECONDS)
 

@@ -180,3 +180,17 @@ def test_training_goes_on_without_its_store(
     assert run.info.run_name == "SurfLSTM wall N=6"
     assert run.info.status == "FINISHED"
     assert {"train/loss", "val/loss", "test/position_median_m"} <= run.data.metrics.keys()
+
+
+def test_a_store_that_is_not_locked_is_waited_for_shortly(
+    logger: MLflowLogger, outage: Outage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Such as an SQLite store on a full disk."""
+    run = str(logger.run_id)
+    outage.on = True
+    logger.client.set_tag(run, "unit", "m")
+    now = [0.0]
+    monkeypatch.setattr(client_module.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(client_module.time, "sleep", lambda seconds: now.__setitem__(0, now[0] + seconds))
+    logger.client.finish()
+    assert client_module.GONE_SECONDS <= now[0] < client_module.LOCKED_SECONDS / 2
