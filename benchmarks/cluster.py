@@ -141,7 +141,7 @@ def main() -> None:
         (model,) = (place.folder / "mlruns" / "checkpoints").glob("*/best.ckpt")
 
         def locate(name: str) -> list[object]:
-            return ["localize", model, "room", "--out", f"{name}.csv"]
+            return ["localize", model, *sorted((place.folder / "room").glob("seq-*")), "--out", f"{name}.csv"]
 
         def count_lines() -> str:
             newest = max(place.folder.glob("*.csv"), key=lambda file: file.stat().st_mtime)
