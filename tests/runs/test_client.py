@@ -85,7 +85,7 @@ def test_a_gap_is_said(
     client = logger.client
     outage.on = True
     logger.log_metrics({"val/loss": 1.0})
-    monkeypatch.setattr(client_module, "LOCKED_SECONDS", 0.0)
+    monkeypatch.setattr(client_module, "GONE_SECONDS", 0.0)
     client.finish()
     assert "1 entries (metrics, parameters, files) since" in caplog.text
 
