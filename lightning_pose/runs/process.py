@@ -48,7 +48,17 @@ def process_tags() -> dict[str, str]:
 def has_died(process: str) -> bool:
     """Whether a process, by its `process_name`, ran on this machine and has ended; False for other machines."""
     host, _, number = process.rpartition(":")
-    return host == identify_machine() and not psutil.pid_exists(int(number))
+    return host == identify_machine() and not _is_running(int(number))
+
+
+def _is_running(number: int) -> bool:
+    """Whether there is a process of this number; one that was killed and that its parent has not asked for is none."""
+    try:
+        return psutil.Process(number).status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
+    except psutil.AccessDenied:
+        return True
 
 
 def has_owner_died(run: Run) -> bool:
