@@ -1,6 +1,6 @@
 """Extraction, a sweep and `localize` on a Dask cluster of two workers on loopback, against one process.
 
-    python -m benchmarks.cluster [--frames 600] [--trials 4] [--rounds 1]
+    python -m benchmarks.cluster [--frames 600] [--trials 4]
 
 Everything runs on this machine, as users type it: `dask scheduler`, two `dask worker` with one thread each, and the
 commands, in the synthetic room. Wall seconds of whole commands, imports included. "killed" is the same with one of the
