@@ -155,7 +155,7 @@ def compare_fallbacks(fitted: FittedMap, frames: TestFrames) -> list[list[object
     similar = []
     for features in fitted.data.dataset("test").data.features.numpy():
         descriptors = features[(features != 0).any(1), :-4]
-        frame, _, _ = matcher.match_candidates(descriptors)
+        frame = matcher.rank_frames(descriptors)[0]
         pose = CameraPose(point_map.given_rotation[frame], point_map.given_position[frame])
         similar.append(MapAnswer(pose, pose, 0, 0, ""))
     errors, of_similar = frames.errors, fitted.measure(similar)

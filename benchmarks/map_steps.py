@@ -24,7 +24,16 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from lightning_pose.geometry.absolute_pose import CameraPose
-from lightning_pose.mapping import build_map, bundle_adjustment, guided_matching, map_localizer, pairs, query_matching
+from lightning_pose.mapping import (
+    build_map,
+    bundle_adjustment,
+    guided_matching,
+    map_localizer,
+    pairs,
+    query_matching,
+    scene_depth,
+    track_points,
+)
 from lightning_pose.mapping.frames import MapFrames, MapQuery
 from lightning_pose.mapping.given_poses import GivenPoses
 from lightning_pose.mapping.guided_matching import KeypointMatches
@@ -38,7 +47,7 @@ def replace_all(owner: object, **values: object) -> Patches:
     return [patch.object(owner, name, value) for name, value in values.items()]
 
 
-def choose_nearest(frames: MapFrames, depth: float) -> np.ndarray:
+def choose_nearest(frames: MapFrames, depth: float) -> pairs.FramePairs:
     """Each frame with the nearest ones that look the same way, not too near to triangulate."""
     baseline = np.linalg.norm(frames.position[:, None] - frames.position[None], axis=2)
     axis = frames.rotation[:, :, 2]
@@ -46,7 +55,7 @@ def choose_nearest(frames: MapFrames, depth: float) -> np.ndarray:
     for i, row in enumerate(np.where(axis @ axis.T > np.cos(np.radians(20)), baseline, np.inf)):
         near = np.flatnonzero((row >= pairs.MIN_BASELINE * depth) & np.isfinite(row))
         found |= {(min(i, j), max(i, j)) for j in near[np.argsort(row[near], kind="stable")][: pairs.PARTNERS].tolist()}
-    return np.array(sorted(found), np.int64)
+    return pairs.FramePairs(np.array(sorted(found), np.int64), few=False)
 
 
 def keep_every_match(frames: MapFrames, matches: KeypointMatches) -> np.ndarray:
@@ -79,7 +88,8 @@ def take_first_descriptor(sum_by_track: Callable) -> Callable:
 
 def match_once(matcher: QueryMatcher, query: MapQuery, points: np.ndarray, pose: CameraPose, *radius_px: float):
     """The matches that RANSAC agreed with, in place of those of the guided pass."""
-    _, rows, matched = matcher.match_candidates(query.descriptors)
+    ranked = matcher.rank_frames(query.descriptors)[: map_localizer.CANDIDATES]
+    rows, matched = matcher.match_frames(query.descriptors, ranked)
     local = (matcher.map.points[matched] - pose.position) @ pose.rotation
     with np.errstate(divide="ignore", invalid="ignore"):
         off = np.linalg.norm(local[:, :2] / local[:, 2:] - points[rows], axis=1) * query.focal_px
@@ -97,23 +107,26 @@ COMPLETE = "nothing left out"
 
 def list_map_steps() -> dict[str, Callable[[], Patches]]:
     """What to replace while a map is built, by the step that is left out."""
-    build, match, adjust = build_map, guided_matching, bundle_adjustment
+    build, match, adjust, tracks = build_map, guided_matching, bundle_adjustment, track_points
     return {
         COMPLETE: list,
+        "measured depth (guessed from the poses)": lambda: replace_all(
+            build, measure_depth=lambda frames: scene_depth.estimate_depth(frames.rotation, frames.position)
+        ),
         "wide baselines (the nearest frames)": lambda: replace_all(build, choose_pairs=choose_nearest),
-        "epipolar band": lambda: replace_all(build, match_pairs=partial(match.match_pairs, band_px=1e6)),
+        "epipolar band": lambda: replace_all(tracks, match_pairs=partial(match.match_pairs, band_px=1e6)),
         "ratio test of pairs": lambda: replace_all(match, RATIO=1.0),
         "size check of pairs": lambda: replace_all(match, SIZE_RATIO=1e6),
-        "depth vote": lambda: replace_all(build, vote_depths=keep_every_match),
-        "one keypoint a frame in a track": lambda: replace_all(build, join_tracks=join_connected),
-        "5 observations a point (3)": lambda: replace_all(build, MIN_OBSERVATIONS=3),
-        "least angle of rays": lambda: replace_all(build, MIN_ANGLE_DEG=0.0),
+        "depth vote": lambda: replace_all(tracks, vote_depths=keep_every_match),
+        "one keypoint a frame in a track": lambda: replace_all(tracks, join_tracks=join_connected),
+        "4 observations a point (3)": lambda: replace_all(build, MIN_OBSERVATIONS=3),
+        "least angle of rays": lambda: replace_all(tracks, MIN_ANGLE_DEG=0.0),
         "mean of descriptors (the first)": lambda: replace_all(
             build, sum_by_track=take_first_descriptor(build.sum_by_track)
         ),
-        "second round of adjustment": lambda: replace_all(build, ADJUSTMENTS=1),
         "offset in adjustment": lambda: replace_all(adjust, OFFSET_SD=(TINY,) * 2),
         "camera in adjustment": lambda: replace_all(adjust, CAMERA_SD_PX=(TINY,) * 2, DISTORTION_SD=TINY),
+        "rolling shutter": lambda: replace_all(adjust, READOUT_SD=TINY),
     }
 
 
@@ -122,7 +135,7 @@ def list_query_steps() -> dict[str, Callable[[], Patches]]:
     query = query_matching
     return {
         "carrying back": lambda: replace_all(GivenPoses, carry_back=lambda self, pose, *turn: pose),
-        "candidates (the whole map)": lambda: replace_all(query, CANDIDATES=10**6),
+        "candidates (the whole map)": lambda: replace_all(map_localizer, CANDIDATES=10**6),
         "ratio tests of queries": lambda: replace_all(query, MATCH_RATIO=1.0, GUIDED_RATIO=1.0),
         "size check of queries": lambda: replace_all(query, SIZE_OCTAVES=99.0),
         "viewing direction": lambda: replace_all(query, MIN_COSINE=-1.0),

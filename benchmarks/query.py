@@ -31,7 +31,7 @@ from lightning_pose.features.surf.detector import detect_keypoints
 from lightning_pose.features.surf.hessian import compute_integral_image
 from lightning_pose.geometry.absolute_pose import find_pose_ransac, refine_pose
 from lightning_pose.localization.trained_system import TrainedSystem
-from lightning_pose.mapping.map_localizer import RANSAC_PX, SIGMA_PX, MapLocalizer
+from lightning_pose.mapping.map_localizer import CANDIDATES, RANSAC_PX, SIGMA_PX, MapLocalizer
 from lightning_pose.mapping.query_matching import QueryMatcher
 from lightning_pose.models.parts.map_network import keypoints_to_frames
 from lightning_pose.scenes.images import read_gray
@@ -73,7 +73,8 @@ def time_stages(stages: Stages, path: Path, system: TrainedSystem, surf: SURF, m
         "map: rays of keypoints", lambda: keypoints_to_frames(features, [network.view], *nowhere).query(0)
     )
     points = network.point_map.camera_correction.remove(query.points)
-    _, rows, matched = stages.time("map: votes and matches", lambda: matcher.match_candidates(query.descriptors))
+    ranked = stages.time("map: votes", lambda: matcher.rank_frames(query.descriptors)[:CANDIDATES])
+    rows, matched = stages.time("map: matches", lambda: matcher.match_frames(query.descriptors, ranked))
     place, sigma = matcher.map.points, SIGMA_PX / query.focal_px
     ransac = stages.time(
         "map: RANSAC", lambda: find_pose_ransac(place[matched], points[rows], RANSAC_PX / query.focal_px)

@@ -35,7 +35,7 @@ class RefinedPose(NamedTuple):
 
 
 def find_pose_ransac(
-    points: np.ndarray, observed: np.ndarray, threshold: float
+    points: np.ndarray, observed: np.ndarray, threshold: float, iterations: int = MAX_ITERATIONS
 ) -> tuple[CameraPose, np.ndarray] | None:
     """The pose on which most points agree: AP3P (Ke & Roumeliotis, CVPR 2017) within RANSAC.
 
@@ -43,6 +43,7 @@ def find_pose_ransac(
         points: (N, 3), in the world.
         observed: (N, 2), normalised image coordinates.
         threshold: largest image error of an inlier, in normalised image coordinates.
+        iterations: samples of four points that are tried at most.
 
     Returns:
         the pose and the (N,) mask of its inliers; None if fewer than four points are given or agree.
@@ -55,7 +56,7 @@ def find_pose_ransac(
         np.ascontiguousarray(observed),
         np.eye(3),
         None,
-        iterationsCount=MAX_ITERATIONS,
+        iterationsCount=iterations,
         reprojectionError=threshold,
         confidence=CONFIDENCE,
         flags=cv2.SOLVEPNP_AP3P,

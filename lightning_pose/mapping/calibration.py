@@ -30,8 +30,8 @@ __all__ = [
 BLOCKS = 5
 """Parts of the training frames, each consecutive, left out in turn."""
 
-FRAMES_PER_BLOCK = 40
-"""Frames of each block that are located, evenly spread."""
+MOST_MEASURED = 200
+"""Frames whose errors are measured in all; half of them at least are training frames left out, evenly spread."""
 
 COVERAGE = 0.9
 """Share of accepted answers that are to lie within their radius."""
@@ -64,15 +64,23 @@ UNKNOWN = Calibration(np.nan, np.nan, np.nan, np.nan, 0.0)
 """Where nothing was left out."""
 
 
-def calibrate_map(mapped: MappedFrames) -> Calibration:
+def calibrate_map(mapped: MappedFrames, others: Measured | None = None) -> Calibration:
     """Leave out blocks of training frames in turn, and compare the map's answers for them with their given poses.
 
     A block's observations leave the points that they helped to place, and its frames lend no offset to an answer.
+
+    Args:
+        mapped: frames and tracks of the map.
+        others: errors of frames that a map of the same scene did not have, such as validation frames before they were
+            added. They are nearer to the map's frames than a block that is left out.
 
     Returns:
         radii by conformal prediction (Vovk, Gammerman, Shafer, 2005): the factor is the quantile of error by standard
         deviation among the accepted.
     """
+
+    known = 0 if others is None else len(others.accepted)
+    per_block = max(MOST_MEASURED // 2, MOST_MEASURED - known) // BLOCKS
 
     def measure_block(block: np.ndarray) -> Measured | None:
         kept = ~np.isin(mapped.tracks.frame, block)
@@ -80,13 +88,14 @@ def calibrate_map(mapped: MappedFrames) -> Calibration:
             return None
         tracks = triangulate_tracks(mapped.seen, mapped.tracks.select(kept), GATES_PX[-1:])  # points hardly move
         localizer = MapLocalizer(summarize_tracks(replace(mapped, tracks=tracks)), without=block)
-        frames = mapped.given.select(block[:: max(1, len(block) // FRAMES_PER_BLOCK)])
+        frames = mapped.given.select(block[:: max(1, len(block) // per_block)])
         return measure_answers([localizer.locate(frames.query(i)) for i in range(len(frames))], frames)
 
     blocks = np.array_split(np.arange(len(mapped.given)), BLOCKS)
     found = [each for each in map_in_threads(measure_block, blocks) if each is not None]
     if not found:
         return UNKNOWN
+    found += [] if others is None else [others]
     return calibrate_answers(Measured(*(np.concatenate(parts) for parts in zip(*found, strict=True))))
 
 
@@ -139,8 +148,12 @@ def measure_answers(answers: Sequence[MapAnswer], frames: MapFrames) -> Measured
 
 
 def find_conformal_factor(ratios: np.ndarray) -> float:
-    """The smallest value that at least 90 % of further ratios would not exceed; nan for too few ratios."""
-    if len(ratios) < MIN_ANSWERS:
+    """The smallest value that at least 90 % of further ratios would not exceed; nan for too few ratios.
+
+    A sample has more small ratios than there are, or fewer: one standard deviation of their number is added.
+    """
+    n = len(ratios)
+    if n < MIN_ANSWERS:
         return np.nan
-    rank = min(int(np.ceil((len(ratios) + 1) * COVERAGE)), len(ratios))
+    rank = min(int(np.ceil((n + 1) * COVERAGE + np.sqrt(n * COVERAGE * (1 - COVERAGE)))), n)
     return float(np.sort(ratios)[rank - 1])

@@ -8,22 +8,27 @@ from typing import Literal, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lightning_pose.geometry.absolute_pose import CameraPose, find_pose_ransac, refine_pose
+from lightning_pose.geometry.absolute_pose import MAX_ITERATIONS, CameraPose, find_pose_ransac, refine_pose
 from lightning_pose.geometry.rolling_shutter import TurningPose, refine_turning_pose, remove_rolling
 from lightning_pose.mapping.frames import MapQuery
 from lightning_pose.mapping.given_poses import GivenPoses
 from lightning_pose.mapping.point_map import PointMap
-from lightning_pose.mapping.query_matching import QueryMatcher
+from lightning_pose.mapping.query_matching import NONE, QueryMatcher
 
 __all__ = ["MapAnswer", "MapLocalizer", "ShownPoints"]
 
 MIN_MATCHES = 8
 """Fewer matches are no start for RANSAC."""
 
-FEW_CANDIDATES = 4
-"""Training frames whose points an image is matched to that was refused before."""
+CANDIDATES, FEW_CANDIDATES, ALONE = 12, 4, 8
+"""Training frames whose points an image is matched to together; fewer if it is refused; and then so many one by one."""
 
-RANSAC_PX = 6.0
+RANSAC_PX = 10.0
+"""Errors of the map where it is weakest are above an image's."""
+
+ITERATIONS_AGAIN = 200
+"""Of RANSAC, where an image was refused before: images of other places would take most of the time."""
+
 SIGMA_PX = 1.0
 """Scale of Cauchy's weights in the last refinement."""
 
@@ -48,7 +53,7 @@ PRIOR_PX = 64.0
 """How far a keypoint may lie from where a prior puts its point."""
 
 SURE_INLIERS = 40
-MOST_PASSES = 3
+MOST_PASSES = 6
 """Guided passes; after each, fewer inliers than that are matched anew from the better pose."""
 
 
@@ -167,17 +172,24 @@ class MapLocalizer:
 
         Frames that look alike and show another place spoil the matches of the right ones, the more of them there are.
         """
-        found = self._solve(query, points, self._matcher.match_candidates(query.descriptors))
-        if found.accepted:
-            return found
-        again = self._solve(query, points, self._matcher.match_candidates(query.descriptors, FEW_CANDIDATES))
-        return again if again.accepted or again.inliers > found.inliers else found
+        ranked = self._matcher.rank_frames(query.descriptors)[:CANDIDATES]
+        if not len(ranked):
+            return self._solve(query, points, (self._first, NONE, NONE))
+        refused: list[MapAnswer] = []
+        for some in (ranked, ranked[:FEW_CANDIDATES], *ranked[:ALONE, None]):
+            matches = int(some[0]), *self._matcher.match_frames(query.descriptors, some)
+            found = self._solve(query, points, matches, ITERATIONS_AGAIN if refused else MAX_ITERATIONS)
+            if found.accepted:
+                return found
+            refused.append(found)
+        return max(refused, key=lambda answer: answer.inliers)
 
     def _solve(
         self,
         query: MapQuery,
         points: np.ndarray,
         matches: tuple[int, np.ndarray, np.ndarray],
+        iterations: int = MAX_ITERATIONS,
     ) -> MapAnswer:
         """The pose on which most matches agree, after one guided pass and refinement.
 
@@ -185,12 +197,13 @@ class MapLocalizer:
             query: the image.
             points: (N, 2), its keypoints with the camera's error removed.
             matches: the frame whose pose holds where none is found, keypoints (K,) and points (K,).
+            iterations: of RANSAC.
         """
         frame, rows, matched = matches
         if len(rows) < MIN_MATCHES:
             few = f"too few features: {len(points)}" if len(points) < MIN_MATCHES else f"too few matches: {len(rows)}"
             return self._refuse(frame, few)
-        found = find_pose_ransac(self.map.points[matched], points[rows], RANSAC_PX / query.focal_px)
+        found = find_pose_ransac(self.map.points[matched], points[rows], RANSAC_PX / query.focal_px, iterations)
         if found is None:
             return self._refuse(frame, f"weak geometry: no pose agrees with four of {len(rows)} matches")
         pose, mask = found

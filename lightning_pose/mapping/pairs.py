@@ -23,10 +23,11 @@ MIN_BASELINE = 0.015
 PARTNERS = 8
 """Partners chosen for each frame, spread evenly from the nearest to the farthest. 12 took longer and gained nothing."""
 
-PARTNERS_OF_FEW = 20
+PARTNERS_OF_FEW = 40
 """The same where the median frame overlaps with at most `FEW_OVERLAPS` others: photos, or a walk that passes once."""
 
 FEW_OVERLAPS = 50
+"""Frames that a frame overlaps with: up to so many are few."""
 
 MOST_COMPARED = 1000
 """Up to so many frames, all are compared with each other; of more, each with so many that look at near places."""

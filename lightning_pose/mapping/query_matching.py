@@ -12,9 +12,6 @@ from lightning_pose.mapping.vote_index import VoteIndex
 
 __all__ = ["QueryMatcher"]
 
-CANDIDATES = 12
-"""Training frames whose points an image is matched to."""
-
 VOTE_DISTANCE = 0.6
 """Largest distance of descriptors for a vote."""
 
@@ -63,34 +60,39 @@ class QueryMatcher:
         self._frames = point_map.seen_frame[np.argsort(point_map.seen_point, kind="stable")]
         self._first_of_point = np.concatenate([[0], np.cumsum(length)])
 
-    def match_candidates(
-        self, descriptors: np.ndarray, candidates: int = CANDIDATES
-    ) -> tuple[int, np.ndarray, np.ndarray]:
-        """Mutual matches with what the most likely training frames saw.
-
-        Each keypoint's nearest point votes for the frames that saw it.
+    def rank_frames(self, descriptors: np.ndarray) -> np.ndarray:
+        """Numbers of the training frames, the most likely first; each keypoint's nearest point votes for its frames.
 
         Args:
             descriptors: (N, D), of an image.
-            candidates: how many frames.
 
         Returns:
-            the most likely frame (-1 for none), and the keypoints (K,) and points (K,) of the matches.
+            (F,) int64; (0,) without descriptors or points.
         """
         if not len(descriptors) or not len(self._descriptors):
-            return -1, NONE, NONE
-        rows = np.arange(len(descriptors))
+            return NONE
         nearest = self._index.find_nearest(descriptors)
-        voted = nearest[self._compare(descriptors, rows, nearest) > 1 - VOTE_DISTANCE**2 / 2]
+        voted = nearest[self._compare(descriptors, np.arange(len(descriptors)), nearest) > 1 - VOTE_DISTANCE**2 / 2]
         first, last = self._first_of_point[voted], self._first_of_point[voted + 1]
         votes = np.bincount(
             self._frames[_join_ranges(first, last)], np.repeat(self._vote[voted], last - first), len(self.map.position)
         )
-        score = votes / np.sqrt(self._points_of_frame + FRAME_PRIOR)
-        best = np.argsort(-score, kind="stable")[:candidates]
-        points = self._list_seen(best)
+        return np.argsort(-votes / np.sqrt(self._points_of_frame + FRAME_PRIOR), kind="stable")
+
+    def match_frames(self, descriptors: np.ndarray, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Mutual matches with what any of some training frames saw.
+
+        Args:
+            descriptors: (N, D), of an image.
+            frames: (K,) numbers of training frames.
+
+        Returns:
+            the keypoints (M,) and points (M,) of the matches.
+        """
+        points = self._list_seen(frames)
         if len(points) < 2:
-            return int(best[0]), NONE, NONE
+            return NONE, NONE
+        rows = np.arange(len(descriptors))
         among = multiply(descriptors, self._descriptors[points].T)
         best_point = among.argmax(axis=1)
         value = among[rows, best_point]
@@ -99,7 +101,7 @@ class QueryMatcher:
         away, second = 1 - value, 1 - among.max(axis=1)
         near = away < MATCH_DISTANCE**2 / 2 * find_distance_scale(descriptors) ** 2
         kept = mutual & near & (away < MATCH_RATIO**2 * second)
-        return int(best[0]), rows[kept], points[best_point[kept]]
+        return rows[kept], points[best_point[kept]]
 
     def match_guided(
         self, query: MapQuery, points: np.ndarray, pose: CameraPose, radius_px: float = GUIDED_PX

@@ -30,7 +30,7 @@ def join_tracks(
     index = index.reshape(-1, 2)
     parent = list(range(len(nodes)))
     frames = (nodes // n_keypoints).tolist()
-    members: dict[int, set[int]] = {}  # frames of each root that has more than its own
+    members: dict[int, int] = {}  # a bit for each frame of a root that has more than its own
     order = np.lexsort((ids[:, 1], ids[:, 0], matches.distance))
     for a, b in zip(*index[order].T.tolist(), strict=True):
         while parent[a] != a:
@@ -39,10 +39,10 @@ def join_tracks(
             parent[b] = b = parent[parent[b]]
         if a == b:
             continue
-        if a > b:
-            a, b = b, a
-        one, other = members.get(a) or {frames[a]}, members.get(b) or {frames[b]}
-        if one.isdisjoint(other):
+        one, other = members.get(a) or 1 << frames[a], members.get(b) or 1 << frames[b]
+        if not one & other:
+            if a > b:
+                a, b = b, a
             members[a] = one | other
             members.pop(b, None)
             parent[b] = a

@@ -83,6 +83,7 @@ class MapBuilder:
         self._camera: Camera | None = None
         self._adjusted: MappedFrames | None = None
         self._val_answers: list[MapAnswer] | None = None
+        self._val_measured: Measured | None = None
 
     def build(self, splits: tuple[str, ...], calibrate: bool) -> None:
         """Build the map of the frames of these splits; unless it is only to be validated, find its radii too.
@@ -103,13 +104,14 @@ class MapBuilder:
                 f"no point of {self.datamodule.scene.root} could be triangulated from {len(frames)} frames; "
                 "`python -m lightning_pose check` says whether the poses fit the images"
             )
-        point_map, calibration = summarize_tracks(mapped), calibrate_map(mapped) if calibrate else UNKNOWN
+        point_map = summarize_tracks(mapped)
+        calibration = calibrate_map(mapped, self._val_measured) if calibrate else UNKNOWN
         self.network.set_map(point_map, camera, calibration)
         if calibrate:
             error_m = calibration.position_error * self.world_frame.scale
             self.say(
                 f"map of {len(frames)} frames: {len(point_map)} points, {point_map.n_bytes / 1e6:.1f} MB, "
-                f"bundle adjustment {_describe_adjustment(mapped)}; training frames left out in turn are located "
+                f"bundle adjustment {_describe_adjustment(mapped)}; frames that were left out are located "
                 f"to {error_m:.3g} {self.datamodule.scene.unit} and {calibration.orientation_error_deg:.2f} degrees "
                 "(median)"
             )
@@ -128,8 +130,9 @@ class MapBuilder:
         if len(self.datamodule.scene.splits["val"]) >= FEWEST_VAL:
             val = self._read_frames(("val",), camera)
             answers = [locate_frames(MapLocalizer(summarize_tracks(each)), val) for each in candidates]
-            best = int(np.argmin([_measure_error(measure_answers(each, val)) for each in answers]))
-            self._val_answers = answers[best]
+            measured = [measure_answers(each, val) for each in answers]
+            best = int(np.argmin([_measure_error(each) for each in measured]))
+            self._val_answers, self._val_measured = answers[best], measured[best]
         else:
             best = int(np.argmin([_measure_error_left_out(each) for each in candidates]))
         chosen = candidates[best]
