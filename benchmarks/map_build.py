@@ -83,7 +83,7 @@ def build(every: MapFrames, is_val: np.ndarray) -> tuple[MapLocalizer, str]:
         spent,
     )
     measured = [measure_answers(each, val) for each in found]
-    best = int(np.argmin([np.median(each.position) * np.median(each.orientation_deg) for each in measured]))
+    best = int(np.argmin([np.log([each.position, each.orientation_deg]).mean() for each in measured]))
     if maps[best] is plain:
         mapped = time_stage("map of all frames", lambda: map_frames(every, adjust=False), spent)
     else:

@@ -25,6 +25,7 @@ __all__ = [
     "locate_frames",
     "measure_answers",
     "measure_frames",
+    "measure_left_out",
 ]
 
 BLOCKS = 5
@@ -65,9 +66,7 @@ UNKNOWN = Calibration(np.nan, np.nan, np.nan, np.nan, 0.0)
 
 
 def calibrate_map(mapped: MappedFrames, others: Measured | None = None) -> Calibration:
-    """Leave out blocks of training frames in turn, and compare the map's answers for them with their given poses.
-
-    A block's observations leave the points that they helped to place, and its frames lend no offset to an answer.
+    """What answers for training frames that are left out say about the map's errors.
 
     Args:
         mapped: frames and tracks of the map.
@@ -78,25 +77,36 @@ def calibrate_map(mapped: MappedFrames, others: Measured | None = None) -> Calib
         radii by conformal prediction (Vovk, Gammerman, Shafer, 2005): the factor is the quantile of error by standard
         deviation among the accepted.
     """
-
     known = 0 if others is None else len(others.accepted)
-    per_block = max(MOST_MEASURED // 2, MOST_MEASURED - known) // BLOCKS
+    found = [measure_left_out(mapped, max(MOST_MEASURED // 2, MOST_MEASURED - known))]
+    found += [] if others is None else [others]
+    every = Measured(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+    return calibrate_answers(every) if len(every.accepted) else UNKNOWN
 
-    def measure_block(block: np.ndarray) -> Measured | None:
+
+def measure_left_out(mapped: MappedFrames, most: int = MOST_MEASURED) -> Measured:
+    """Leave out blocks of training frames in turn, and compare the map's answers for them with their given poses.
+
+    A block's observations leave the points that they helped to place, and its frames lend no offset to an answer.
+
+    Args:
+        mapped: frames and tracks of the map.
+        most: frames that are located, about.
+    """
+
+    def measure_block(block: np.ndarray) -> Measured:
         kept = ~np.isin(mapped.tracks.frame, block)
-        if not kept.any() or not len(block):
-            return None
+        if not kept.any():
+            block = block[:0]
+        if not len(block):
+            return measure_answers([], mapped.given.select(block))
         tracks = triangulate_tracks(mapped.seen, mapped.tracks.select(kept), GATES_PX[-1:])  # points hardly move
         localizer = MapLocalizer(summarize_tracks(replace(mapped, tracks=tracks)), without=block)
-        frames = mapped.given.select(block[:: max(1, len(block) // per_block)])
+        frames = mapped.given.select(block[:: max(1, len(block) * BLOCKS // most)])
         return measure_answers([localizer.locate(frames.query(i)) for i in range(len(frames))], frames)
 
     blocks = np.array_split(np.arange(len(mapped.given)), BLOCKS)
-    found = [each for each in map_in_threads(measure_block, blocks) if each is not None]
-    if not found:
-        return UNKNOWN
-    found += [] if others is None else [others]
-    return calibrate_answers(Measured(*(np.concatenate(parts) for parts in zip(*found, strict=True))))
+    return Measured(*(np.concatenate(parts) for parts in zip(*map_in_threads(measure_block, blocks), strict=True)))
 
 
 def calibrate_answers(found: Measured) -> Calibration:

@@ -54,7 +54,7 @@ PRIOR_PX = 64.0
 
 SURE_INLIERS = 40
 MOST_PASSES = 6
-"""Guided passes; after each, fewer inliers than that are matched anew from the better pose."""
+"""Guided passes; after each, fewer inliers than that are matched anew from the better pose, `MIN_MATCHES` at least."""
 
 
 class ShownPoints(NamedTuple):
@@ -221,7 +221,7 @@ class MapLocalizer:
             projected = local[:, :2] / np.maximum(local[:, 2:], 1e-9)
             inlier = np.linalg.norm(projected - observed, axis=1) * query.focal_px <= INLIER_PX
             inliers = int(inlier.sum())
-            if inliers >= SURE_INLIERS:
+            if inliers >= SURE_INLIERS or inliers < MIN_MATCHES:
                 break
         return self._answer(refined, inliers, visible, ShownPoints(seen, projected, observed, inlier))
 

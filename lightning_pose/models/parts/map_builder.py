@@ -22,7 +22,14 @@ from lightning_pose.mapping.build_map import (
     roll_mapped,
     summarize_tracks,
 )
-from lightning_pose.mapping.calibration import UNKNOWN, Measured, calibrate_map, locate_frames, measure_answers
+from lightning_pose.mapping.calibration import (
+    UNKNOWN,
+    Measured,
+    calibrate_map,
+    locate_frames,
+    measure_answers,
+    measure_left_out,
+)
 from lightning_pose.mapping.conventions import fit_focal_length
 from lightning_pose.mapping.frame_matches import match_nearby_frames
 from lightning_pose.mapping.frames import MapFrames
@@ -134,7 +141,7 @@ class MapBuilder:
             best = int(np.argmin([_measure_error(each) for each in measured]))
             self._val_answers, self._val_measured = answers[best], measured[best]
         else:
-            best = int(np.argmin([_measure_error_left_out(each) for each in candidates]))
+            best = int(np.argmin([_measure_error(measure_left_out(each)) for each in candidates]))
         chosen = candidates[best]
         self._adjusts = chosen is not plain
         self._adjusted = chosen if self._adjusts else None
@@ -211,14 +218,9 @@ class MapBuilder:
 
 
 def _measure_error(measured: Measured) -> float:
-    """Median error of positions times that of orientations."""
-    return float(np.median(measured.position) * np.median(measured.orientation_deg))
-
-
-def _measure_error_left_out(mapped: MappedFrames) -> float:
-    """The same of training frames that are left out of the map in turn."""
-    left_out = calibrate_map(mapped)
-    return left_out.position_error * left_out.orientation_error_deg
+    """Mean logarithm of the errors of positions and orientations: it tells more of few frames than their medians do."""
+    errors = np.stack([measured.position, measured.orientation_deg])
+    return float(np.log(np.maximum(errors, np.finfo(float).tiny)).mean()) if errors.size else np.inf
 
 
 def _describe_adjustment(mapped: MappedFrames) -> str:
