@@ -3,10 +3,10 @@
     python -m benchmarks.map_build --root DIR [--pgt DIR] [--threads 1 2] [--n_features 300]
 
 Stages: decoding the images of training and validation and extracting SURF; the map of the training frames; its bundle
-adjustment; the same for a rolling shutter; validation frames located with the three; the validation frames added to
-the best, with new matches and adjustment once more, or where adjusting helped nothing a map of all frames as they are;
-the radii. Evaluation, imports
-and checkpoints are not in it. The hash of the map is the same for any number of threads.
+adjustment; the same for a rolling shutter; which of the three locates validation frames best; the validation frames
+added to that, with new matches and adjustment once more, or where adjusting helped nothing a map of all frames as they
+are; the radii. Evaluation, imports and checkpoints are not in it. The hash of the map is the same for any number of
+threads.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from lightning_pose.features.surf import SURF
 from lightning_pose.geometry.absolute_pose import CameraPose
 from lightning_pose.geometry.camera import Camera
 from lightning_pose.mapping.build_map import add_frames, adjust_mapped, map_frames, roll_mapped, summarize_tracks
-from lightning_pose.mapping.calibration import calibrate_map, locate_frames, measure_answers, measure_frames
+from lightning_pose.mapping.calibration import calibrate_map, choose_map, measure_answers, measure_frames
 from lightning_pose.mapping.frames import MapFrames
 from lightning_pose.mapping.map_localizer import MapLocalizer
 from lightning_pose.models.parts.map_network import keypoints_to_frames
@@ -77,25 +77,23 @@ def build(every: MapFrames, is_val: np.ndarray) -> tuple[MapLocalizer, str]:
     adjusted = time_stage("bundle adjustment", lambda: adjust_mapped(plain, rounds=1), spent)
     rolled = time_stage("rolling shutter", lambda: roll_mapped(adjusted), spent)
     maps = [adjusted, rolled, plain]
-    found = time_stage(
-        "validation frames located with the three",
-        lambda: [locate_frames(MapLocalizer(summarize_tracks(each)), val) for each in maps],
+    best, found = time_stage(
+        "the best of the three, by validation frames located",
+        lambda: choose_map([summarize_tracks(each) for each in maps], val),
         spent,
     )
-    measured = [measure_answers(each, val) for each in found]
-    best = int(np.argmin([np.log([each.position, each.orientation_deg]).mean() for each in measured]))
     if maps[best] is plain:
         mapped = time_stage("map of all frames", lambda: map_frames(every, adjust=False), spent)
     else:
         back = MapLocalizer(summarize_tracks(maps[best]))
         poses = [
             answer.pose_in_map if answer.accepted else back.given_poses.carry_forward(CameraPose(rotation, position))
-            for answer, rotation, position in zip(found[best], val.rotation, val.position, strict=True)
+            for answer, rotation, position in zip(found, val.rotation, val.position, strict=True)
         ]
         rows = np.flatnonzero(~is_val)
         mapped = time_stage("validation frames added", lambda: add_frames(maps[best], every, rows, poses), spent)
     point_map = summarize_tracks(mapped)
-    time_stage("radii", lambda: calibrate_map(mapped, measured[best]), spent)
+    time_stage("radii", lambda: calibrate_map(mapped, measure_answers(found, val)), spent)
     print(f"| all without features | {sum(spent):.2f} | |")
     digest = hashlib.sha256(b"".join(array.tobytes() for _, array in sorted(vars(point_map).items())))
     return MapLocalizer(point_map), digest.hexdigest()[:12]

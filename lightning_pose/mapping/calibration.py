@@ -11,6 +11,7 @@ import numpy as np
 from lightning_pose.mapping.build_map import MappedFrames, summarize_tracks
 from lightning_pose.mapping.frames import MapFrames
 from lightning_pose.mapping.map_localizer import MapAnswer, MapLocalizer
+from lightning_pose.mapping.point_map import PointMap
 from lightning_pose.mapping.threads import map_in_threads
 from lightning_pose.mapping.track_points import GATES_PX, triangulate_tracks
 
@@ -21,6 +22,7 @@ __all__ = [
     "Measured",
     "calibrate_answers",
     "calibrate_map",
+    "choose_map",
     "find_conformal_factor",
     "locate_frames",
     "measure_answers",
@@ -36,6 +38,9 @@ MOST_MEASURED = 200
 
 COVERAGE = 0.9
 """Share of accepted answers that are to lie within their radius."""
+
+MOST_CHOOSING = 60
+"""Frames that say which of some maps is best."""
 
 MIN_ANSWERS = 10
 """Fewer accepted answers are no ground for a radius."""
@@ -130,6 +135,24 @@ class Measured(NamedTuple):
     position_sd: np.ndarray
     orientation_sd_deg: np.ndarray
     inliers: np.ndarray
+
+    @property
+    def mean_log_error(self) -> float:
+        """Of positions and orientations; it tells more of few frames than their medians do. inf without frames."""
+        errors = np.stack([self.position, self.orientation_deg])
+        return float(np.log(np.maximum(errors, np.finfo(float).tiny)).mean()) if errors.size else np.inf
+
+
+def choose_map(maps: Sequence[PointMap], frames: MapFrames) -> tuple[int, list[MapAnswer]]:
+    """Which of some maps locates frames best, `MOST_CHOOSING` of them evenly spread, and its answers for all."""
+    localizers, n = [MapLocalizer(each) for each in maps], len(frames)
+    some = np.unique(np.linspace(0, n - 1, min(n, MOST_CHOOSING)).round().astype(int))
+    answers = [locate_frames(localizer, frames.select(some)) for localizer in localizers]
+    best = int(np.argmin([measure_answers(each, frames.select(some)).mean_log_error for each in answers]))
+    others = np.setdiff1d(np.arange(n), some)
+    found = dict(zip(some.tolist(), answers[best], strict=True))
+    found.update(zip(others.tolist(), locate_frames(localizers[best], frames.select(others)), strict=True))
+    return best, [found[i] for i in range(n)]
 
 
 def measure_frames(localizer: MapLocalizer, frames: MapFrames) -> Measured:

@@ -5,8 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lightning_pose.mapping.build_map import map_frames
-from lightning_pose.mapping.calibration import MIN_ANSWERS, Measured, calibrate_map, find_conformal_factor
+from lightning_pose.mapping import calibration
+from lightning_pose.mapping.build_map import build_point_map, map_frames
+from lightning_pose.mapping.calibration import (
+    MIN_ANSWERS,
+    Measured,
+    calibrate_map,
+    choose_map,
+    find_conformal_factor,
+)
 from tests.mapping.helpers import make_frames, make_walk
 
 
@@ -32,3 +39,14 @@ def test_errors_of_other_frames_count_beside_those_left_out(ratio: float, larger
     alone, both = calibrate_map(mapped), calibrate_map(mapped, make_errors(60, ratio))
     assert (both.position_factor > alone.position_factor) == larger
     assert (both.position_error > alone.position_error) == larger
+
+
+def test_the_map_that_locates_frames_best_is_chosen_and_locates_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(calibration, "MOST_CHOOSING", 5)
+    training, others = make_frames(*make_walk(60)), make_frames(*make_walk(17, seed=3), seed=3)
+    noise = np.random.default_rng(0).normal(0, 0.03, (60, 3))
+    wrong = training.with_poses(training.rotation, training.position + noise)
+    maps = [build_point_map(frames) for frames in (wrong, training)]
+    best, answers = choose_map(maps, others)
+    assert best == 1
+    np.testing.assert_allclose([answer.pose.position for answer in answers], others.position, atol=0.02)

@@ -26,6 +26,7 @@ from lightning_pose.mapping.calibration import (
     UNKNOWN,
     Measured,
     calibrate_map,
+    choose_map,
     locate_frames,
     measure_answers,
     measure_left_out,
@@ -136,12 +137,10 @@ class MapBuilder:
         candidates = [adjusted, rolled, *([plain] if self.bundle_adjust == "auto" else [])]
         if len(self.datamodule.scene.splits["val"]) >= FEWEST_VAL:
             val = self._read_frames(("val",), camera)
-            answers = [locate_frames(MapLocalizer(summarize_tracks(each)), val) for each in candidates]
-            measured = [measure_answers(each, val) for each in answers]
-            best = int(np.argmin([_measure_error(each) for each in measured]))
-            self._val_answers, self._val_measured = answers[best], measured[best]
+            best, self._val_answers = choose_map([summarize_tracks(each) for each in candidates], val)
+            self._val_measured = measure_answers(self._val_answers, val)
         else:
-            best = int(np.argmin([_measure_error(measure_left_out(each)) for each in candidates]))
+            best = int(np.argmin([measure_left_out(each).mean_log_error for each in candidates]))
         chosen = candidates[best]
         self._adjusts = chosen is not plain
         self._adjusted = chosen if self._adjusts else None
@@ -215,12 +214,6 @@ class MapBuilder:
             f"{residual_px:.2f} px off their epipolar lines); data.camera sets another"
         )
         return Camera(width, height, focal_px, focal_px, (width - 1) / 2, (height - 1) / 2)
-
-
-def _measure_error(measured: Measured) -> float:
-    """Mean logarithm of the errors of positions and orientations: it tells more of few frames than their medians do."""
-    errors = np.stack([measured.position, measured.orientation_deg])
-    return float(np.log(np.maximum(errors, np.finfo(float).tiny)).mean()) if errors.size else np.inf
 
 
 def _describe_adjustment(mapped: MappedFrames) -> str:
