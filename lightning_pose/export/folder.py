@@ -8,7 +8,6 @@ import json
 import os
 import shutil
 import tempfile
-import time
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -32,6 +31,7 @@ from lightning_pose.localization.trained_system import TrainedSystem
 from lightning_pose.models import LandmarkMap
 from lightning_pose.models.clip import ClipModule
 from lightning_pose.models.parts.checkpoint_hooks import LEARNT_FRAMES
+from lightning_pose.runs.process import is_abandoned, name_owner
 
 __all__ = ["Exported", "export_system"]
 
@@ -39,9 +39,6 @@ NETWORK_FILE, RUNNER_FILE = "model.onnx", "localizer.py"
 
 UNFINISHED = ".exporting"
 """End of the name of a folder that is being written."""
-
-STALE_SECONDS = 3600
-"""The writer of an unfinished folder this old was killed."""
 
 AT_FDCWD, RENAME_EXCHANGE = -100, 2  # of Linux's renameat2
 
@@ -106,7 +103,8 @@ def export_system(
     check_target(out, overwrite)
     out.parent.mkdir(parents=True, exist_ok=True)
     _delete_abandoned(out)
-    with tempfile.TemporaryDirectory(prefix=f".{out.name}.", suffix=UNFINISHED, dir=out.parent) as parent:
+    prefix = f".{out.name}.{name_owner()}."
+    with tempfile.TemporaryDirectory(prefix=prefix, suffix=UNFINISHED, dir=out.parent) as parent:
         folder = Path(parent) / out.name
         folder.mkdir()
         facts = describe_system(system, checkpoint) | write_parts(system, folder)
@@ -159,10 +157,11 @@ def _exchange(a: Path, b: Path) -> bool:
 
 def _delete_abandoned(out: Path) -> None:
     """Delete what earlier exports to the same place have left that were killed."""
-    for abandoned in out.parent.glob(f".{out.name}.*{UNFINISHED}"):
+    for unfinished in out.parent.glob(f".{out.name}.*{UNFINISHED}"):
+        owner = unfinished.name.removeprefix(f".{out.name}.").partition(".")[0]
         with suppress(OSError):  # another process may delete it first
-            if time.time() - abandoned.stat().st_mtime > STALE_SECONDS:
-                shutil.rmtree(abandoned)
+            if is_abandoned(unfinished, owner):
+                shutil.rmtree(unfinished)
 
 
 def describe_system(system: TrainedSystem, checkpoint: Mapping[str, Any]) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,11 @@ from lightning_pose.data.batches import PoseBatch
 from lightning_pose.data.datamodule import find_datamodule
 from lightning_pose.errors import CheckpointError
 from lightning_pose.runs.callbacks import find_callback
-from lightning_pose.runs.checkpoint_files import use_checkpoint_files
+from lightning_pose.runs.checkpoint_files import (
+    delete_abandoned,
+    find_checkpoint_files,
+    use_checkpoint_files,
+)
 from lightning_pose.runs.logger import MLflowLogger
 from lightning_pose.runs.random_state import RandomState, collect_random_states, restore_random_state
 from lightning_pose.runs.resume import read_seed
@@ -32,6 +37,13 @@ def checkpoint_folder(trainer: Trainer) -> Path:
     """Where the run's checkpoints are: `checkpoints/RUN_ID` under the trainer's root, `local` without a run."""
     logger = next(iter(trainer.loggers), None)
     return Path(trainer.default_root_dir) / "checkpoints" / str(logger.version if logger else "local")
+
+
+def _flush(trainer: Trainer) -> None:
+    """Write the checkpoints that are kept in memory."""
+    files = find_checkpoint_files(trainer)
+    if files is not None:
+        files.flush()
 
 
 class _RunCheckpoint(ModelCheckpoint):
@@ -53,10 +65,23 @@ class _RunCheckpoint(ModelCheckpoint):
             return  # other processes do not know the run
         try:
             checkpoint_folder(trainer).mkdir(parents=True, exist_ok=True)
+            delete_abandoned(checkpoint_folder(trainer).parent)
         except OSError as error:
             raise CheckpointError(
                 f"cannot make {self.dirpath} ({error.strerror}); choose another folder with --trainer.default_root_dir"
             ) from error
+
+    def _save_checkpoint(self, trainer: Trainer, filepath: str) -> None:
+        files = find_checkpoint_files(trainer)
+        with nullcontext() if files is None else files.hold():
+            super()._save_checkpoint(trainer, filepath)
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        _flush(trainer)
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        if not isinstance(exception, CheckpointError):  # it could not write
+            _flush(trainer)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore the best score of the same run; its folder may have moved."""
@@ -108,6 +133,7 @@ class BestCheckpoint(_RunCheckpoint):
         self._log_best(trainer)
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        super().on_exception(trainer, pl_module, exception)
         self._log_best(trainer)
 
     def _log_best(self, trainer: Trainer) -> None:
@@ -167,6 +193,9 @@ class LastCheckpoint(_RunCheckpoint):
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         super().on_fit_start(trainer, pl_module)
+        logger, files = run_logger(trainer), find_checkpoint_files(trainer)
+        if logger is not None and files is not None:
+            files.before_write = logger.send_metrics
         self._log_missing(trainer)
         if self.finishes and self._stopped:
             trainer.should_stop = True
@@ -184,9 +213,7 @@ class LastCheckpoint(_RunCheckpoint):
         logger, metrics = run_logger(trainer), self._logged.get("metrics")
         if logger is None or not metrics:
             return
-        step, name = self._logged["step"], next(iter(metrics))
-        if all(metric.step != step for metric in logger.client.get_metric_history(str(logger.run_id), name)):
-            logger.log_metrics(metrics, step)
+        logger.log_metrics(metrics, self._logged["step"])
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if self._random_states is not None:

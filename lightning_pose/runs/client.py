@@ -5,15 +5,17 @@ from __future__ import annotations
 import logging
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
-from typing import TypeVar
+from typing import TypeVar, cast
 
 from mlflow import MlflowClient
-from mlflow.entities import Param, Run, RunData, RunTag
+from mlflow.entities import Metric, Param, Run, RunData, RunTag
 from mlflow.exceptions import MlflowException
 from sqlalchemy.exc import SQLAlchemyError
 
+from lightning_pose.runs.pace import Pace
 from lightning_pose.runs.reader import mask_passwords
 
 __all__ = ["BufferedClient", "is_unreachable", "wait_while_locked"]
@@ -44,6 +46,9 @@ REFUSALS = {
     "RESOURCE_DOES_NOT_EXIST",
 }
 """What a store says of a request that is wrong; it would refuse it later, too."""
+
+MOST_METRICS = 1000
+"""Metrics that MLflow takes at once."""
 
 WAIT_SECONDS = 5.0
 """The shortest time between two attempts to reach a store that is gone."""
@@ -80,6 +85,9 @@ class BufferedClient(MlflowClient):
         super().__init__(uri)
         self._uri = uri
         self._pending: deque[Write] = deque()
+        self._holds = False
+        self._waiting: dict[str, list[Metric]] = {}
+        self._pace = Pace()
         self._lost = 0
         self._next_attempt = 0.0
         self._gone_since = ""
@@ -91,6 +99,30 @@ class BufferedClient(MlflowClient):
             setattr(self, name, partial(self._write, name, getattr(self, name)))
         for name in READS:
             setattr(self, name, partial(self._read, getattr(self, name)))
+
+    @property
+    def is_due(self) -> bool:
+        """Whether metrics that wait for others are to be sent."""
+        return self._pace.is_due
+
+    @contextmanager
+    def hold(self) -> Iterator[None]:
+        """Metrics that are logged here wait for `send_metrics`, or for whatever else is written or read."""
+        self._holds = True
+        try:
+            yield
+        finally:
+            self._holds = False
+
+    def send_metrics(self) -> None:
+        """Send the metrics that wait for others: many in one transaction take little longer than one."""
+        if self._is_writing:
+            return
+        for run_id, metrics in list(self._waiting.items()):
+            with self._pace.measure():
+                for first in range(0, len(metrics), MOST_METRICS):
+                    self.attempt(partial(super().log_batch, run_id, metrics[first : first + MOST_METRICS]))
+            del self._waiting[run_id]
 
     def attempt(self, write: Write) -> None:
         """Do something that writes to the store; keep it for later while the store is gone."""
@@ -104,6 +136,7 @@ class BufferedClient(MlflowClient):
 
     def finish(self) -> None:
         """Send what is kept; wait for the store, and say what is missing there if it does not come back."""
+        self.send_metrics()
         began = time.monotonic()
         while self._pending and not self._send_pending():
             if time.monotonic() - began >= (LOCKED_SECONDS if self._is_locked else GONE_SECONDS):
@@ -120,6 +153,7 @@ class BufferedClient(MlflowClient):
 
     def get_run(self, run_id: str) -> Run:
         """Read a run; while the store is gone, as it was read last, with what is to be written since."""
+        self.send_metrics()
         known = self._runs.get(run_id)
         if known is not None and self._pending and time.monotonic() < self._next_attempt:
             return known
@@ -134,12 +168,16 @@ class BufferedClient(MlflowClient):
     def _write(self, name: str, method: Callable[..., object], /, run_id: str, *args: object, **kwargs: object) -> None:
         """Call one of `WRITES`, now or later."""
         if not self._is_writing:
+            if self._holds and name == "log_batch":
+                self._waiting.setdefault(run_id, []).extend(cast(list[Metric], kwargs["metrics"]))
+                return
+            self.send_metrics()
             self._remember(name, run_id, args, kwargs)
         self.attempt(partial(method, run_id, *args, **kwargs))
 
-    @staticmethod
-    def _read(method: Callable[..., object], /, *args: object, **kwargs: object) -> object:
+    def _read(self, method: Callable[..., object], /, *args: object, **kwargs: object) -> object:
         """Call one of `READS`."""
+        self.send_metrics()
         return wait_while_locked(partial(method, *args, **kwargs))
 
     def _remember(self, name: str, run_id: str, args: tuple[object, ...], kwargs: dict[str, object]) -> None:

@@ -56,6 +56,9 @@ REQUIREMENTS = (
 
 PACKAGE = Path(__file__).parents[1]
 
+MEASURED_ANEW = ("test/", "best/", "cost/")
+"""How the names of metrics begin that a resumed run logs again."""
+
 PARAMETER_LENGTH = 250
 """Characters of a parameter that Lightning's logger keeps."""
 
@@ -109,6 +112,8 @@ class MLflowLogger(MLFlowLogger):
         self.stopped_as = "FAILED"
         self._opened = False
         self._claimed = False
+        self._resumes = run_id is not None
+        self._known_steps: dict[str, set[int]] = {}
 
     @property
     def experiment(self) -> MlflowClient:
@@ -176,12 +181,26 @@ class MLflowLogger(MLFlowLogger):
 
     @rank_zero_only
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
-        """Log metrics; Ctrl-C and other signals take effect once they are written."""
-        if sqlite_file(self.uri) is None:
-            super().log_metrics(metrics, step)
-            return
-        with delay_interrupts():
-            super().log_metrics(metrics, step)
+        """Log metrics, now or some seconds later; a resumed run keeps what it has of a step."""
+        new = {name: value for name, value in metrics.items() if not self._has(name, step)}
+        with self.client.hold():
+            super().log_metrics(new, step)
+        if self.client.is_due:
+            self.send_metrics()
+
+    def send_metrics(self) -> None:
+        """Send the metrics that wait for others; Ctrl-C and other signals take effect once they are written."""
+        with delay_interrupts() if sqlite_file(self.uri) else nullcontext():
+            self.client.send_metrics()
+
+    def _has(self, name: str, step: int | None) -> bool:
+        """Whether the run had a metric of training at this step when this process took it over."""
+        if step is None or not self._resumes or name.startswith(MEASURED_ANEW):
+            return False
+        if name not in self._known_steps:
+            history = self.client.get_metric_history(str(self.run_id), name)
+            self._known_steps[name] = {metric.step for metric in history}
+        return step in self._known_steps[name]
 
     @rank_zero_only
     def finalize(self, status: str = "success") -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import socket
+import time
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -15,7 +16,20 @@ import psutil
 if TYPE_CHECKING:
     from mlflow.entities import Run
 
-__all__ = ["HOST_TAG", "PROCESS_TAG", "has_died", "has_owner_died", "identify_machine", "process_name", "process_tags"]
+__all__ = [
+    "HOST_TAG",
+    "PROCESS_TAG",
+    "has_died",
+    "has_owner_died",
+    "identify_machine",
+    "is_abandoned",
+    "name_owner",
+    "process_name",
+    "process_tags",
+]
+
+STALE_SECONDS = 3600
+"""What a process of another machine has left unfinished for so long is abandoned."""
 
 HOST_TAG, PROCESS_TAG = "process.host", "process.id"
 
@@ -49,6 +63,23 @@ def has_died(process: str) -> bool:
     """Whether a process, by its `process_name`, ran on this machine and has ended; False for other machines."""
     host, _, number = process.rpartition(":")
     return host == identify_machine() and not _is_running(int(number))
+
+
+def name_owner(number: int | None = None) -> str:
+    """This process, or the one of a number on this machine, as a part of a file's name without points."""
+    machine = hashlib.sha256(identify_machine().encode()).hexdigest()[:12]
+    return f"{machine}-{os.getpid() if number is None else number}"
+
+
+def is_abandoned(unfinished: Path, owner: str) -> bool:
+    """Whether the process that was writing a file or folder, by its `name_owner`, was killed.
+
+    On another machine that is taken for granted after an hour.
+    """
+    number = owner.rpartition("-")[2]
+    if number.isdecimal() and owner == name_owner(int(number)):
+        return not _is_running(int(number))
+    return time.time() - unfinished.stat().st_mtime > STALE_SECONDS
 
 
 def _is_running(number: int) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -30,6 +31,7 @@ from lightning_pose.localization.localizer import Localizer
 from lightning_pose.localization.located_pose import LocatedPose
 from lightning_pose.localization.trained_system import TrainedSystem
 from lightning_pose.models import LinearPoseNet
+from lightning_pose.runs.process import name_owner
 from tests.export.helpers import BACKBONE, COLUMNS
 from tests.rooms import MappedRoom
 
@@ -211,6 +213,18 @@ def test_a_folder_is_not_written_over(folder: Path, copied: Path, mapped_room: M
     (tmp_path / "mine" / "thesis.txt").touch()
     assert export(mapped_room.checkpoint, "--out", tmp_path / "mine", "--overwrite") == 2
     assert [file.name for file in (tmp_path / "mine").iterdir()] == ["thesis.txt"]
+
+
+def test_what_killed_exports_have_left_is_deleted(copied: Path, mapped_room: MappedRoom) -> None:
+    ended = subprocess.Popen(["true"])
+    ended.wait()
+    owners = name_owner(ended.pid), name_owner(), "0123456789ab-1", "0123456789ab-2"
+    killed, running, old, elsewhere = left = [copied.parent / f".{copied.name}.{name}.abc.exporting" for name in owners]
+    for each in left:
+        each.mkdir()
+    os.utime(old, (0, 0))
+    assert export(mapped_room.checkpoint, "--out", copied, "--overwrite") == 0
+    assert [each.exists() for each in (killed, running, old, elsewhere)] == [False, True, False, True]
 
 
 def test_mistakes_are_one_line(mapped_room: MappedRoom, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -10,7 +12,9 @@ from lightning import Trainer
 
 from lightning_pose.checkpoint import read_checkpoint
 from lightning_pose.errors import CheckpointError
+from lightning_pose.runs import pace
 from lightning_pose.runs.checkpoint_files import CheckpointFiles, use_checkpoint_files
+from lightning_pose.runs.process import name_owner
 from tests.helpers import Trained, Workplace, limit_file_size
 
 BIG = {"lightning_pose": {}, "state_dict": {"weight": torch.zeros(100_000)}}
@@ -27,15 +31,19 @@ def test_a_full_disk_leaves_the_old_file(tmp_path: Path) -> None:
     assert [found.name for found in tmp_path.iterdir()] == ["last.ckpt"]
 
 
-def test_a_killed_process_leaves_the_old_file(tmp_path: Path) -> None:
-    """It is gone while it writes beside the old file; what it leaves is overwritten by the next one."""
-    file = tmp_path / "last.ckpt"
-    CheckpointFiles().save_checkpoint(SMALL, file)
-    (tmp_path / "last.ckpt.tmp").write_bytes(b"half a checkpoint")
-    assert read_checkpoint(file)["state_dict"]["weight"].tolist() == [1]
-    CheckpointFiles().save_checkpoint(BIG, file)
-    assert len(read_checkpoint(file)["state_dict"]["weight"]) == 100_000
-    assert [found.name for found in tmp_path.iterdir()] == ["last.ckpt"]
+def test_a_killed_process_leaves_the_old_file(workplace: Workplace) -> None:
+    """It is gone while it writes beside the old file; what it leaves is deleted by the next training."""
+    assert workplace.run("fit") == 0
+    (run,) = workplace.runs()
+    file = workplace.checkpoint(run, "last")
+    ended = subprocess.Popen(["true"])
+    ended.wait()
+    killed, running = (file.with_name(f"last.ckpt.{name_owner(each)}.tmp") for each in (ended.pid, None))
+    for each in (killed, running):
+        each.write_bytes(b"half a checkpoint")
+    assert read_checkpoint(file)["state_dict"]
+    assert workplace.run("fit") == 0
+    assert (killed.exists(), running.exists()) == (False, True)
 
 
 def test_nothing_is_written_into_the_temporary_folder(workplace: Workplace, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -91,3 +99,50 @@ def test_a_folder_that_cannot_be_made_is_refused_before_training(
     output = "".join(capfd.readouterr())
     assert "choose another folder with --trainer.default_root_dir" in output
     assert "epoch 1/" not in output
+
+
+def make_busy_files() -> CheckpointFiles:
+    """Whose last write was so slow that the next one is not due for seconds."""
+    files = CheckpointFiles()
+    files._pace._next = float("inf")
+    return files
+
+
+def test_of_what_is_held_the_newest_is_written(tmp_path: Path) -> None:
+    files, events = make_busy_files(), []
+    files.before_write = lambda: events.append(sorted(file.name for file in tmp_path.iterdir()))
+    weight = torch.zeros(1)
+    with files.hold():
+        for value in (1.0, 2.0):
+            weight.fill_(value)
+            files.save_checkpoint({"lightning_pose": {}, "state_dict": {"weight": weight}}, tmp_path / "last.ckpt")
+    weight.fill_(3.0)  # training goes on
+    assert not list(tmp_path.iterdir())
+    files.flush()
+    files.flush()
+    assert events == [[]]
+    assert read_checkpoint(tmp_path / "last.ckpt")["state_dict"]["weight"].tolist() == [2]
+
+
+def test_outside_hold_a_checkpoint_is_written_at_once(tmp_path: Path) -> None:
+    make_busy_files().save_checkpoint(SMALL, tmp_path / "own.ckpt")
+    assert read_checkpoint(tmp_path / "own.ckpt")["state_dict"]["weight"].tolist() == [1]
+
+
+@pytest.mark.parametrize("callback", ["tests.helpers.FailAt", None])
+def test_short_epochs_are_on_the_disk_when_training_ends(
+    callback: str | None, workplace: Workplace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pace, "SHARE", 1e9)
+    monkeypatch.setattr(pace, "LONGEST_S", 1e9)
+    words = ["--trainer.max_epochs", "4"]
+    if callback is not None:
+        words += ["--trainer.callbacks+", callback, "--trainer.callbacks.epoch", "3"]
+    with nullcontext() if callback is None else pytest.raises(RuntimeError):
+        workplace.run("fit", *words)
+    (run,) = workplace.runs()
+    for name in ("last", "best"):
+        assert workplace.checkpoint(run, name).is_file()
+    state = torch.load(workplace.checkpoint(run, "last"), weights_only=True)
+    assert state["epoch"] == (3 if callback is None else 2)
+    assert len(workplace.client.get_metric_history(run.info.run_id, "train/loss")) == state["epoch"] + 1

@@ -72,6 +72,20 @@ def test_the_best_epoch_before_the_stop_is_kept(workplace: Workplace) -> None:
     assert workplace.runs()[0].data.metrics["best/val/loss"] == pytest.approx(min(losses))
 
 
+def test_a_run_goes_on_from_an_older_checkpoint_and_logs_no_epoch_twice(workplace: Workplace) -> None:
+    # As after `kill -9` within epochs that are shorter than a write.
+    settings = ["--trainer.max_epochs", "5"]
+    run = stop_run(workplace, *settings, *stop_at("tests.helpers.FailAt", 2))
+    older = workplace.checkpoint(run, "last").read_bytes()
+    with contextlib.suppress(RuntimeError):
+        workplace.run("fit", *settings, "--ckpt_path", "last", *stop_at("tests.helpers.FailAt", 4))
+    workplace.checkpoint(run, "last").write_bytes(older)
+    assert workplace.run("fit", *settings, "--ckpt_path", "last") == 0
+    for name in ("train/loss", "val/loss"):
+        history = workplace.client.get_metric_history(run.info.run_id, name)
+        assert len({metric.step for metric in history}) == len(history) == 5
+
+
 @pytest.mark.parametrize("early", [False, True])
 def test_a_run_stopped_after_its_last_epoch_goes_on_to_its_test(early: bool, workplace: Workplace) -> None:
     settings = ["--trainer.max_epochs", "2"]
