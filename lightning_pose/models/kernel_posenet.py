@@ -69,6 +69,10 @@ class KernelPoseNet(TrainingMemory, ClosedFormModule):
             self.network.set_landmarks(self.standardize_input(features[kept].to(self.device)), self.gamma)
 
 
+LEAST_DIAGONAL = 1e-9
+"""Added to each landmark's kernel with itself, which is 1."""
+
+
 class _KernelMachine(LinearNetwork):
     """Seven numbers, linear in an image's kernels with M landmarks.
 
@@ -86,30 +90,28 @@ class _KernelMachine(LinearNetwork):
         self.register_buffer("landmarks", torch.zeros(0, n_columns))
         self.register_buffer("scale", torch.ones((), dtype=torch.float64))
         self.register_buffer("bias", torch.zeros(7, dtype=torch.float64))
-        self._basis = torch.zeros(0, 0)  # (M, R), from kernels to coordinates whose products are kernels again
+        self._factor = torch.zeros(0, 0)  # (M, M), lower triangle: times its transpose it is the landmarks' kernels
 
     @property
     def n_lifted(self) -> int:
-        return self._basis.shape[1]
+        return len(self._factor)
 
     def set_landmarks(self, landmarks: Tensor, gamma: float) -> None:
-        """Keep (M, D) landmarks, measure their spread, and make the basis of `lift`."""
+        """Keep (M, D) landmarks, measure their spread, and factorise their kernels for `lift`."""
         self.landmarks = self._to_keys(landmarks)
         self.weight.data = self.weight.new_zeros(len(landmarks), 7)
         sample = self.landmarks[:: -(-len(landmarks) // 1000)].double()
         squared = F.pdist(sample).square()
         spread = float(squared.median()) if len(squared) else 1.0
         self.scale.fill_(gamma / spread if spread > 0 else gamma)
-        values, vectors = torch.linalg.eigh(self._kernel(self.landmarks))
-        kept = values > values[-1] * len(values) * torch.finfo(values.dtype).eps
-        self._basis = vectors[:, kept] / values[kept].sqrt()
+        self._factor = _factorise(self._kernel(self.landmarks))
 
     def lift(self, features: Tensor) -> Tensor:
-        """(B, D) -> (B, R), whose products with each other are the images' kernels."""
-        return self._kernel(self._to_keys(features)) @ self._basis
+        """(B, D) -> (B, M), whose products with each other are the images' kernels."""
+        return torch.linalg.solve_triangular(self._factor, self._kernel(self._to_keys(features)).T, upper=False).T
 
     def set_solution(self, solution: Ridge) -> None:
-        self.weight.copy_(self._basis @ solution.weight.T)
+        self.weight.copy_(torch.linalg.solve_triangular(self._factor.T, solution.weight.T, upper=True))
         self.bias.copy_(solution.bias)
 
     def forward(self, features: Tensor) -> Tensor:
@@ -124,3 +126,16 @@ class _KernelMachine(LinearNetwork):
         ours, theirs = keys.double(), self.landmarks.double()
         squared = ours.square().sum(1, keepdim=True) + theirs.square().sum(1) - 2 * ours @ theirs.T
         return torch.exp(-self.scale * squared.clamp(min=0))
+
+
+def _factorise(kernels: Tensor) -> Tensor:
+    """Cholesky's factor of (M, M) kernels, with little on the diagonal, and more where rounding asks for it.
+
+    Equal landmarks make equal rows. What is added acts as so much more ridge.
+    """
+    one = torch.eye(len(kernels)).to(kernels)
+    for diagonal in (LEAST_DIAGONAL, 10 * LEAST_DIAGONAL, 100 * LEAST_DIAGONAL):
+        factor, failed = torch.linalg.cholesky_ex(kernels + diagonal * one)
+        if not failed:
+            return factor
+    return torch.linalg.cholesky(kernels + 1000 * LEAST_DIAGONAL * one)

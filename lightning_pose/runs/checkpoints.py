@@ -152,7 +152,7 @@ class BestCheckpoint(_RunCheckpoint):
 
 
 class LastCheckpoint(_RunCheckpoint):
-    """`last.ckpt`: everything that training needs to resume, written after every epoch.
+    """`last.ckpt`: everything that training needs to resume, of the last epoch; short ones are written together.
 
     A run that goes on from it draws the same random numbers as one that was not stopped.
 
