@@ -20,6 +20,7 @@ from lightning_pose.losses import LossConfig, PoseLoss
 from lightning_pose.metrics.item_means import ItemMeans, key_items, key_poses
 from lightning_pose.metrics.pose_metrics import PoseMetrics
 from lightning_pose.models.parts.divergence import DivergenceWatch
+from lightning_pose.models.parts.epoch_means import EpochMeans
 from lightning_pose.models.parts.poses import Located, Pose, check_features, check_poses
 from lightning_pose.models.parts.refined_module import RefinedModule
 from lightning_pose.models.parts.refinement import MapSettings
@@ -128,6 +129,7 @@ class PoseModule(RefinedModule, StandardizedModule):
         self.loss = PoseLoss(loss)
         self.world_frame = WorldFrame(centred=not self.reads_clips)
         self.divergence = DivergenceWatch(self._name_frame)
+        self._train_means = EpochMeans()
         self.val_metrics, self.val_losses = PoseMetrics(), ItemMeans()
         self.test_metrics, self.test_losses = PoseMetrics(), ItemMeans()
         self.register_scales()
@@ -238,12 +240,17 @@ class PoseModule(RefinedModule, StandardizedModule):
         return self.loss(position, quat_raw, truth, target, by_item), position, quat_raw
 
     def _train_step(self, batch: PoseBatch) -> Tensor:
-        """The loss of a training batch, with its terms logged."""
+        """The loss of a training batch, with its terms kept for `_log_training`."""
         terms, position, _ = self._compare(batch, by_item=False)
-        named = {_name_loss("train", name): term for name, term in terms.items()}
-        self.log_dict(named, on_step=False, on_epoch=True, batch_size=len(batch.frame), sync_dist=True)
+        self._train_means.add(terms, len(batch.frame))
         self.divergence.add_step(terms["total"], position, batch.position_m, batch.frame, self._remedy)
         return terms["total"]
+
+    def _log_training(self) -> None:
+        """Log the means of the loss's terms over the batches since the last time."""
+        named = {_name_loss("train", name): mean for name, mean in self._train_means.take().items()}
+        # Processes have as many items each, so that the mean of their means is the mean over all.
+        self.log_dict(named, on_step=False, on_epoch=True, batch_size=1, sync_dist=True)
 
     def _judge_step(self, batch: PoseBatch, metrics: PoseMetrics, losses: ItemMeans) -> Pose:
         """The poses, in the world, of a batch of validation or test, with their errors and losses collected."""
@@ -272,7 +279,10 @@ class PoseModule(RefinedModule, StandardizedModule):
         return pose
 
     def training_step(self, batch: PoseBatch, batch_idx: int) -> Tensor | None:
-        return self._train_step(batch)
+        loss = self._train_step(batch)
+        if self.trainer.is_last_batch:  # before the validation that closes the epoch
+            self._log_training()
+        return loss
 
     def validation_step(self, batch: PoseBatch, batch_idx: int) -> None:
         self._judge_step(batch, self.val_metrics, self.val_losses)
@@ -298,6 +308,7 @@ class PoseModule(RefinedModule, StandardizedModule):
         Raises:
             ConfigError: it has.
         """
+        self._log_training()  # of an epoch that ends early
         self.refit_refinement()
         self.divergence.check_epoch(self._remedy)
         self.divergence.check_weights(self.parameters(), self._remedy)
