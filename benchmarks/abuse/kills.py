@@ -67,15 +67,19 @@ def _watch(process: ForkedProcess, most: float) -> float:
 
 
 def read_result(place: Workplace) -> Result:
-    """Weights and test metrics of the newest run of a workplace."""
+    """Weights of the newest run of a workplace, and all that it has logged but costs."""
     run = place.runs()[0]
     found: dict[str, object] = {"status": run.info.status}
     found |= {name: value for name, value in run.data.metrics.items() if not name.startswith("cost/")}
     for name in ("best", "last"):
         weights = torch.load(place.checkpoint(run, name), weights_only=True)["state_dict"]
         found |= {f"{name}.{key}": value.numpy().tobytes() for key, value in weights.items()}
-    history = MlflowClient(place.uri).get_metric_history(run.info.run_id, "train/loss")
-    return found | {"epochs": sorted({(metric.step, metric.value) for metric in history})}
+    client = MlflowClient(place.uri)
+    for name in run.data.metrics:
+        if not name.startswith("cost/"):
+            history = client.get_metric_history(run.info.run_id, name)
+            found[f"{name} by step"] = sorted((metric.step, metric.value) for metric in history)
+    return found
 
 
 def _kill_fit(base: Workplace, words: Sequence[object], seconds: float, expected: Result) -> str:
