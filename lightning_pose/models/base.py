@@ -279,10 +279,11 @@ class PoseModule(RefinedModule, StandardizedModule):
         return pose
 
     def training_step(self, batch: PoseBatch, batch_idx: int) -> Tensor | None:
-        loss = self._train_step(batch)
+        return self._train_step(batch)
+
+    def on_train_batch_end(self, outputs: object, batch: PoseBatch, batch_idx: int) -> None:
         if self.trainer.is_last_batch:  # before the validation that closes the epoch
             self._log_training()
-        return loss
 
     def validation_step(self, batch: PoseBatch, batch_idx: int) -> None:
         self._judge_step(batch, self.val_metrics, self.val_losses)

@@ -56,8 +56,8 @@ REQUIREMENTS = (
 
 PACKAGE = Path(__file__).parents[1]
 
-MEASURED_ANEW = ("test/", "best/", "cost/")
-"""How the names of metrics begin that a resumed run logs again."""
+TRAINING = ("train/", "val/", "epoch")
+"""How the names of metrics begin that have one value a step."""
 
 PARAMETER_LENGTH = 250
 """Characters of a parameter that Lightning's logger keeps."""
@@ -113,7 +113,7 @@ class MLflowLogger(MLFlowLogger):
         self._opened = False
         self._claimed = False
         self._resumes = run_id is not None
-        self._known_steps: dict[str, set[int]] = {}
+        self._known: dict[str, dict[int, float]] = {}
 
     @property
     def experiment(self) -> MlflowClient:
@@ -181,8 +181,8 @@ class MLflowLogger(MLFlowLogger):
 
     @rank_zero_only
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
-        """Log metrics, now or some seconds later; a resumed run keeps what it has of a step."""
-        new = {name: value for name, value in metrics.items() if not self._has(name, step)}
+        """Log metrics, now or some seconds later; a run keeps what it has of a step."""
+        new = {name: value for name, value in metrics.items() if not self._has(name, step or 0, float(value))}
         with self.client.hold():
             super().log_metrics(new, step)
         if self.client.is_due:
@@ -193,14 +193,19 @@ class MLflowLogger(MLFlowLogger):
         with delay_interrupts() if sqlite_file(self.uri) else nullcontext():
             self.client.send_metrics()
 
-    def _has(self, name: str, step: int | None) -> bool:
-        """Whether the run had a metric of training at this step when this process took it over."""
-        if step is None or not self._resumes or name.startswith(MEASURED_ANEW):
-            return False
-        if name not in self._known_steps:
-            history = self.client.get_metric_history(str(self.run_id), name)
-            self._known_steps[name] = {metric.step for metric in history}
-        return step in self._known_steps[name]
+    def _has(self, name: str, step: int, value: float) -> bool:
+        """Whether the run has a metric of this step: any value of training, or this one of what is measured later.
+
+        A run that goes on after `kill -9` may do an epoch, or its test, once more.
+        """
+        if name not in self._known:
+            history = self.client.get_metric_history(str(self.run_id), name) if self._resumes else []
+            self._known[name] = {metric.step: metric.value for metric in history}
+        known = self._known[name]
+        if step in known and (name.startswith(TRAINING) or known[step] == value):
+            return True
+        known[step] = value
+        return False
 
     @rank_zero_only
     def finalize(self, status: str = "success") -> None:
