@@ -101,10 +101,8 @@ def measure_left_out(mapped: MappedFrames, most: int = MOST_MEASURED) -> Measure
 
     def measure_block(block: np.ndarray) -> Measured:
         kept = ~np.isin(mapped.tracks.frame, block)
-        if not kept.any():
-            block = block[:0]
-        if not len(block):
-            return measure_answers([], mapped.given.select(block))
+        if not kept.any() or not len(block):
+            return measure_answers([], mapped.given.select(block[:0]))
         tracks = triangulate_tracks(mapped.seen, mapped.tracks.select(kept), GATES_PX[-1:])  # points hardly move
         localizer = MapLocalizer(summarize_tracks(replace(mapped, tracks=tracks)), without=block)
         frames = mapped.given.select(block[:: max(1, len(block) * BLOCKS // most)])
@@ -138,7 +136,7 @@ class Measured(NamedTuple):
 
     @property
     def mean_log_error(self) -> float:
-        """Of positions and orientations; it tells more of few frames than their medians do. inf without frames."""
+        """Of positions and orientations; of few frames it varies less than their medians. inf without frames."""
         errors = np.stack([self.position, self.orientation_deg])
         return float(np.log(np.maximum(errors, np.finfo(float).tiny)).mean()) if errors.size else np.inf
 

@@ -119,9 +119,13 @@ class BufferedClient(MlflowClient):
         if self._is_writing:
             return
         for run_id, metrics in list(self._waiting.items()):
-            with self._pace.measure():
-                for first in range(0, len(metrics), MOST_METRICS):
-                    self.attempt(partial(super().log_batch, run_id, metrics[first : first + MOST_METRICS]))
+            try:
+                with self._pace.measure():
+                    for first in range(0, len(metrics), MOST_METRICS):
+                        self.attempt(partial(super().log_batch, run_id, metrics[first : first + MOST_METRICS]))
+            except MlflowException:  # refused, such as of a run that is deleted: it would be the next time, too
+                del self._waiting[run_id]
+                raise
             del self._waiting[run_id]
 
     def attempt(self, write: Write) -> None:

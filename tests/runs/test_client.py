@@ -194,3 +194,13 @@ def test_a_store_that_is_not_locked_is_waited_for_shortly(
     monkeypatch.setattr(client_module.time, "sleep", lambda seconds: now.__setitem__(0, now[0] + seconds))
     logger.client.finish()
     assert client_module.GONE_SECONDS <= now[0] < client_module.LOCKED_SECONDS / 2
+
+
+def test_metrics_that_are_refused_are_not_sent_again(workplace: Workplace, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(workplace.folder)
+    client = MLflowLogger(tracking_uri=workplace.uri).client
+    with client.hold():
+        client.log_batch("0" * 32, metrics=[Metric("a", 1.0, 0, 0)])
+    with pytest.raises(MlflowException, match="not found"):
+        client.send_metrics()
+    client.send_metrics()
