@@ -3,7 +3,7 @@
     python -m benchmarks.ridge [--frames 1000 7000 100000] [--kernel 2000] [--rounds 5]
 
 Rounds of all alternate in one process, on the same 2048 features, each on one thread; CPU seconds count, so that other
-work on the machine does not. Ours streams float32 batches, as the data module serves them, and computes in float64.
+work on the machine does not. Ours streams float32 batches, as the data module serves them, and is as exact as float64.
 scikit-learn gets the whole matrix at once, in double precision, in which it is as exact as ours. The goal is 0.7 of
 its time. Standard error says how far the answers are apart, and what float32 and eight lambdas take.
 """
@@ -27,6 +27,7 @@ from threadpoolctl import threadpool_limits
 
 from benchmarks.measurement import Goal, Measurement, Options, format_table
 from lightning_pose.models import KernelPoseNet
+from lightning_pose.models.parts.refined_ridge import solve_ridges
 from lightning_pose.models.parts.ridge import Moments
 
 FRAMES, KERNEL_FRAMES, FEATURES, BATCH = [1000, 7000, 100_000], 2000, 2048, 256
@@ -50,10 +51,14 @@ def make_features(frames: int, width: int = FEATURES) -> tuple[torch.Tensor, tor
 
 def solve_ours(x: torch.Tensor, y: torch.Tensor, lambdas: list[float]) -> np.ndarray:
     """(7, D) weights for LAMBDA."""
-    moments = Moments(x.shape[1], y.shape[1])
-    for batch in zip(x.split(BATCH), y.split(BATCH), strict=True):
+
+    def list_batches() -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+        return zip(x.split(BATCH), y.split(BATCH), strict=True)
+
+    moments = Moments(x.shape[1], y.shape[1], torch.float32)
+    for batch in list_batches():
         moments.add(*batch)
-    return moments.ridge(lambdas)[lambdas.index(LAMBDA)].weight.numpy()
+    return solve_ridges(moments, lambdas, list_batches)[lambdas.index(LAMBDA)].weight.numpy()
 
 
 def solve_theirs(x: np.ndarray, y: np.ndarray) -> np.ndarray:

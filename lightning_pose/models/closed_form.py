@@ -16,6 +16,7 @@ from lightning_pose.data.datamodule import scene_datamodule
 from lightning_pose.errors import ConfigError
 from lightning_pose.geometry.quaternions import align_hemisphere
 from lightning_pose.models.base import PoseModule
+from lightning_pose.models.parts.refined_ridge import solve_ridges
 from lightning_pose.models.parts.ridge import Moments, Ridge
 
 __all__ = ["ClosedFormModule", "LinearNetwork"]
@@ -24,7 +25,14 @@ _CHUNK = 1024  # frames at a time
 
 
 class LinearNetwork(nn.Module, ABC):
-    """Seven numbers that are linear in what `lift` makes of the features, solved at once by ridge regression."""
+    """Seven numbers that are linear in what `lift` makes of the features, solved at once by ridge regression.
+
+    Attributes:
+        products_in: the precision of products of lifted features. From single precision, which takes half the time,
+            weights are corrected in further passes over the frames.
+    """
+
+    products_in: ClassVar[torch.dtype] = torch.float32
 
     @property
     @abstractmethod
@@ -47,8 +55,8 @@ class LinearNetwork(nn.Module, ABC):
 class ClosedFormModule(PoseModule):
     """Base class of the architectures that one ridge regression solves; `self.network` is a `LinearNetwork`.
 
-    One pass over the training batches sums their moments in double precision; memory is of the order of R x R for
-    any number of frames, and under several processes the sums are joined. Each lambda is solved for, and the one with
+    One pass over the training batches sums their moments; memory is of the order of R x R for any number of frames,
+    and under several processes the sums are joined. Each lambda is solved for, to double precision, and the one with
     the lowest loss on validation frames is kept.
 
     Args:
@@ -95,7 +103,9 @@ class ClosedFormModule(PoseModule):
         return torch.optim.SGD(self.parameters())
 
     def on_train_epoch_start(self) -> None:
-        self.moments = Moments(self.network.n_lifted, 7)
+        # Principal components of single precision could not be corrected.
+        precision = self.network.products_in if self.components is None else torch.float64
+        self.moments = Moments(self.network.n_lifted, 7, precision)
 
     def training_step(self, batch: PoseBatch, batch_idx: int) -> None:
         self.add_frames(batch, len(scene_datamodule(self.trainer).dataset("train")))
@@ -109,7 +119,7 @@ class ClosedFormModule(PoseModule):
         if self.refit and self._validates:
             for batch in self._batches("val"):
                 self.moments.add(*self._regression_terms(batch))
-            self.network.set_solution(self.moments.ridge([self._lambda], self.components)[0])
+            self.network.set_solution(self._find_solutions([self._lambda], ["train", "val"])[0])
         for batch in self._batches("train"):
             self._train_step(batch)
         self.log("train/lambda", self._lambda)
@@ -144,10 +154,16 @@ class ClosedFormModule(PoseModule):
                 f"lambdas is {self.lambdas}, and there are no validation frames to choose by; "
                 "give one, or set data.val_fraction, such as 0.1"
             )
-        solutions = self.moments.ridge(self.lambdas, self.components)
+        solutions = self._find_solutions(self.lambdas, ["train"])
         best = min(range(len(solutions)), key=lambda i: self._val_loss(solutions[i])) if self._validates else 0
         self.network.set_solution(solutions[best])
         self._lambda = self.lambdas[best]
+
+    def _find_solutions(self, lambdas: list[float], splits: list[str]) -> list[Ridge]:
+        """The solution for each lambda; the moments are of all frames of these splits."""
+        if self.components is not None:
+            return self.moments.ridge(lambdas, self.components)
+        return solve_ridges(self.moments, lambdas, lambda: map(self._regression_terms, self._batches(*splits)))
 
     @property
     def _validates(self) -> bool:
@@ -172,8 +188,9 @@ class ClosedFormModule(PoseModule):
         features = self.network.lift(self.standardize_input(batch.features))
         return features, (poses - self.pose_mean) / self.pose_scale
 
-    def _batches(self, split: str) -> Iterator[PoseBatch]:
-        """All frames of a split, localized, in every process."""
-        data = self.localize_batch(scene_datamodule(self.trainer).dataset(split).data)
-        for parts in zip(*(tensor.split(_CHUNK) for tensor in data), strict=True):
-            yield PoseBatch(*(part.to(self.device) for part in parts))
+    def _batches(self, *splits: str) -> Iterator[PoseBatch]:
+        """All frames of splits, localized, in every process."""
+        for split in splits:
+            data = self.localize_batch(scene_datamodule(self.trainer).dataset(split).data)
+            for parts in zip(*(tensor.split(_CHUNK) for tensor in data), strict=True):
+                yield PoseBatch(*(part.to(self.device) for part in parts))

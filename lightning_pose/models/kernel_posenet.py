@@ -79,6 +79,7 @@ class _KernelMachine(LinearNetwork):
     In double precision throughout: solutions cancel large numbers.
     """
 
+    products_in: ClassVar[torch.dtype] = torch.float64
     landmarks: Tensor
     scale: Tensor
     bias: Tensor
@@ -100,11 +101,13 @@ class _KernelMachine(LinearNetwork):
         """Keep (M, D) landmarks, measure their spread, and factorise their kernels for `lift`."""
         self.landmarks = self._to_keys(landmarks)
         self.weight.data = self.weight.new_zeros(len(landmarks), 7)
-        sample = self.landmarks[:: -(-len(landmarks) // 1000)].double()
-        squared = F.pdist(sample).square()
-        spread = float(squared.median()) if len(squared) else 1.0
+        squared = _square_distances(self.landmarks, self.landmarks)
+        step = -(-len(landmarks) // 1000)
+        sample = squared[::step, ::step]
+        rows, columns = torch.triu_indices(*sample.shape, offset=1)
+        spread = float(sample[rows, columns].median()) if len(rows) else 1.0
         self.scale.fill_(gamma / spread if spread > 0 else gamma)
-        self._factor = _factorise(self._kernel(self.landmarks))
+        self._factor = _factorise(torch.exp(-self.scale * squared))
 
     def lift(self, features: Tensor) -> Tensor:
         """(B, D) -> (B, M), whose products with each other are the images' kernels."""
@@ -123,9 +126,14 @@ class _KernelMachine(LinearNetwork):
 
     def _kernel(self, keys: Tensor) -> Tensor:
         """(B, D) -> (B, M)."""
-        ours, theirs = keys.double(), self.landmarks.double()
-        squared = ours.square().sum(1, keepdim=True) + theirs.square().sum(1) - 2 * ours @ theirs.T
-        return torch.exp(-self.scale * squared.clamp(min=0))
+        return torch.exp(-self.scale * _square_distances(keys, self.landmarks))
+
+
+def _square_distances(a: Tensor, b: Tensor) -> Tensor:
+    """Squared distances (B, M) between (B, D) and (M, D), in double precision."""
+    ours, theirs = a.double(), b.double()
+    squared = ours.square().sum(1, keepdim=True) + theirs.square().sum(1)
+    return squared.addmm_(ours, theirs.T, alpha=-2).clamp_(min=0)
 
 
 def _factorise(kernels: Tensor) -> Tensor:

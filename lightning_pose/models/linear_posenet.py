@@ -17,8 +17,9 @@ __all__ = ["LinearPoseNet"]
 class LinearPoseNet(ClosedFormModule):
     """Ridge regression (eq. 5.2) from (D,) features to the pose, without gradients.
 
-    One pass over the training batches sums their moments in double precision; memory is of the order of D x D for
-    any number of frames. The lambda with the lowest loss on validation frames is kept.
+    One pass over the training batches sums their moments; memory is of the order of D x D for any number of frames.
+    Further passes make the weights exact (`solve_ridges`). The lambda with the lowest loss on validation frames is
+    kept.
 
     Args:
         lambdas: ridge strengths to choose from, in squared units of the features, summed over frames.

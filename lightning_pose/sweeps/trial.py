@@ -23,7 +23,7 @@ from lightning_pose.errors import ConfigError, PoseError
 from lightning_pose.evaluation.callback import TestReport
 from lightning_pose.evaluation.costs import costs
 from lightning_pose.features.keypoint_statistics import measure_keypoints
-from lightning_pose.models.parts.ridge import shared_factors
+from lightning_pose.models.parts.symmetric import shared_factors
 from lightning_pose.runs.checkpoints import BestCheckpoint, checkpoint_folder, run_logger
 from lightning_pose.runs.process import process_tags
 from lightning_pose.runs.signals import delay_interrupts

@@ -2,28 +2,35 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
-from collections import OrderedDict
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-import numpy as np
 import torch
-from scipy.linalg.blas import dsyrk  # pyright: ignore[reportAttributeAccessIssue]
 from torch import Tensor
 
 from lightning_pose.errors import ConfigError
+from lightning_pose.models.parts.symmetric import Solve, add_products, factorise, find_eigenvectors
 
-__all__ = ["Moments", "Ridge", "Spectrum", "shared_factors"]
+__all__ = ["Equations", "Moments", "Ridge", "Spectrum"]
 
-_MOST_KEPT = 4  # factorisations: with and without the validation frames, for two kinds of features
-_sharing = ContextVar("_sharing", default=False)
-_factors: OrderedDict[bytes, tuple[Tensor, Tensor]] = OrderedDict()
 
-_BLOCKS = 8  # of the Gram matrix's columns: the upper triangle takes 36 of 64 products
+class Equations(NamedTuple):
+    """(A + lambda I) Z = B, with products A of features, or of frames while these are fewer.
+
+    Attributes:
+        solve: finds Z for any B of the same type.
+        sides: B, (D, T) products of features and targets, or (N, T) targets.
+        frames: (N, D) centred features; None where the products are of features.
+    """
+
+    solve: Solve
+    sides: Tensor
+    frames: Tensor | None
+
+    def to_weight(self, answer: Tensor) -> Tensor:
+        """(T, D) weights from Z."""
+        return answer.T if self.frames is None else answer.T @ self.frames.to(answer)
 
 
 class Ridge(NamedTuple):
@@ -68,48 +75,8 @@ class Spectrum(NamedTuple):
         return Spectrum(self.values[:components], self.vectors[:, :components], self.mean)
 
 
-@contextmanager
-def shared_factors() -> Iterator[None]:
-    """Within the block, the same features are factorised once, for any number of lambdas and components.
-
-    Factorisations are kept after the block, and found again by the content of the features. It is off by default
-    because a single lambda is solved faster without.
-    """
-    token = _sharing.set(True)
-    try:
-        yield
-    finally:
-        _sharing.reset(token)
-
-
-def _factorise_gram(gram: Tensor) -> tuple[Tensor, Tensor]:
-    """Eigenvalues, ascending, and eigenvectors of a symmetric matrix, given by its upper triangle."""
-    if not _sharing.get():
-        return torch.linalg.eigh(gram, UPLO="U")
-    key = hashlib.blake2b(gram.contiguous().cpu().numpy().data, digest_size=20).digest()
-    if key not in _factors:
-        _factors[key] = torch.linalg.eigh(gram, UPLO="U")
-        while len(_factors) > _MOST_KEPT:
-            _factors.popitem(last=False)
-    _factors.move_to_end(key)
-    return _factors[key]
-
-
-def _add_products(gram: Tensor, x: Tensor) -> None:
-    """Add x.T @ x, of (N, D) rows, to the upper triangle of (D, D)."""
-    if gram.is_cpu:  # half the products of a full one in 0.8 of the time that torch takes for the blocks below
-        rows = np.ascontiguousarray(x.numpy())
-        dsyrk(
-            1.0, rows.T, beta=1.0, c=gram.numpy().T, lower=True, overwrite_c=True
-        )  # which is the upper one in C order
-        return
-    width = -(-len(gram) // _BLOCKS)
-    for i in range(0, len(gram), width):
-        gram[i : i + width, i:].addmm_(x[:, i : i + width].T, x[:, i:])
-
-
 class Moments:
-    """Count, means and centred second moments of features (D) and targets (T), in float64, from a stream of frames.
+    """Count, means and centred second moments of features (D) and targets (T), from a stream of frames.
 
     Memory is of the order of D x D, however many frames come. Up to D frames are kept as they are: for so few, the
     products of frames are a smaller problem than those of features. More are folded into the features' Gram matrix,
@@ -118,12 +85,19 @@ class Moments:
     Args:
         n_features: D.
         n_targets: T; 0 where only principal components are wanted.
+        dtype: of products, and of features that are kept. Single precision takes half the time, and weights are then
+            off by some ten-thousandths until `solve_ridges` corrects them. Means and targets are in double precision.
+
+    Attributes:
+        sizes: D and T.
     """
 
-    def __init__(self, n_features: int, n_targets: int = 0) -> None:
-        self._sizes = [n_features, n_targets]
-        self._rows = torch.empty(0)  # (D + 1, D + T), of which the first `_n_rows` are not yet folded
+    def __init__(self, n_features: int, n_targets: int = 0, dtype: torch.dtype = torch.float64) -> None:
+        self.dtype = dtype
+        self.sizes = [n_features, n_targets]
+        self._x = self._y = torch.empty(0)  # (D + 1, D) and (D + 1, T), of which `_n_rows` are not yet folded
         self._n_rows = 0
+        self._rows_mean: Tensor | None = None
         self._n_folded = 0
         self._mean = self._gram = self._cross = torch.empty(0)  # of the folded; of the Gram, the upper triangle
 
@@ -134,16 +108,18 @@ class Moments:
 
     def add(self, x: Tensor, y: Tensor) -> None:
         """Add features (B, D) and targets (B, T) of further frames."""
-        most = self._sizes[0]
+        most = self.sizes[0]
         if not self.count:
-            self._rows = x.new_empty(most + 1, sum(self._sizes), dtype=torch.float64)
+            self._x = x.new_empty(most + 1, most, dtype=self.dtype)
+            self._y = x.new_empty(most + 1, self.sizes[1], dtype=torch.float64)
         while len(x):
             if self._n_rows == most:
                 self._fold()
             first, room = self._n_rows, most - self._n_rows
-            for part, kept in zip((x, y), self._rows.split(self._sizes, dim=1), strict=True):
+            for part, kept in ((x, self._x), (y, self._y)):
                 kept[first : first + room][: len(part)] = part[:room]
             self._n_rows += len(x[:room])
+            self._rows_mean = None
             x, y = x[room:], y[room:]
 
     def all_reduce(self, total: Callable[[Tensor], Tensor]) -> None:
@@ -151,7 +127,7 @@ class Moments:
         self._fold()
         count = total(self._mean.new_tensor([self._n_folded]))
         mean = total(self._mean * self._n_folded) / count
-        x, y = (self._mean - mean).split(self._sizes)
+        x, y = (self._mean - mean).to(self.dtype).split(self.sizes)
         self._gram = total(self._gram.addr_(x, x, alpha=self._n_folded))
         self._cross = total(self._cross.addr_(x, y, alpha=self._n_folded))
         self._mean, self._n_folded = mean, int(count)
@@ -159,8 +135,8 @@ class Moments:
     def ridge(self, lambdas: Sequence[float], components: int | None = None) -> list[Ridge]:
         """Minimise |Y - X W|^2 + lambda |W|^2 (thesis, eq. 5.2) for each lambda; the bias is not penalised.
 
-        All lambdas and principal components use one eigendecomposition. A single lambda on all features uses a
-        Cholesky factorisation, which takes a tenth of the time, except within `shared_factors`.
+        All lambdas on principal components use one eigendecomposition. One on all features uses a Cholesky
+        factorisation, which takes a thirtieth of the time.
 
         Args:
             lambdas: each above 0.
@@ -168,76 +144,101 @@ class Moments:
 
         Raises:
             ConfigError: there are fewer components.
+            LinAlgError: a lambda is too small for the precision.
         """
-        mean, cross = self._mean_and_cross()
-        if components is None and len(lambdas) == 1 and not _sharing.get():
-            coefficients, basis = [self._solve_by_cholesky(lambdas[0], cross)], None
-        else:
-            values, basis, _ = self.spectrum() if components is None else self.spectrum().first(components)
-            projected = basis.T @ cross
-            coefficients = [(projected / (values + strength)[:, None]).T for strength in lambdas]
-        mean_x, mean_y = mean.split(self._sizes)
-        answers = []
-        for own in coefficients:
-            weight = own if basis is None else own @ basis.T
-            answers.append(Ridge(weight, mean_y - weight @ mean_x, weight if components is None else own))
+        if components is None:
+            equations = self.pose_equations(lambdas)
+            return [self.make_ridge(each.to_weight(each.solve(each.sides))) for each in equations]
+        spectrum, answers = self.spectrum().first(components), []
+        projected = spectrum.vectors.T @ self._find_cross()
+        for strength in lambdas:
+            coefficients = (projected / (spectrum.values + strength)[:, None]).T
+            answers.append(self.make_ridge(coefficients @ spectrum.vectors.T, coefficients))
         return answers
 
-    def _solve_by_cholesky(self, strength: float, cross: Tensor) -> Tensor:
-        """(T, D) weights for one lambda, from the products of features, or of frames while these are fewer."""
+    def pose_equations(self, lambdas: Sequence[float]) -> list[Equations]:
+        """For each lambda the system of equations whose answer are the weights, factorised.
+
+        Raises:
+            LinAlgError: a lambda is too small for the precision.
+        """
         if self._n_folded:
-            self._gram.diagonal().add_(strength)
-            factor = torch.linalg.cholesky(self._gram, upper=True)
-            self._gram.diagonal().sub_(strength)
-            return torch.cholesky_solve(cross, factor, upper=True).T
-        rows = self._rows[: self._n_rows]
-        x, y = (rows - rows.mean(0)).split(self._sizes, dim=1)
+            self._fold()
+            return [Equations(factorise(self._gram, strength), self._cross, None) for strength in lambdas]
+        x, y = self._centre_rows()
         gram = x.new_zeros(len(x), len(x))
-        _add_products(gram, x.T)
-        gram.diagonal().add_(strength)
-        return torch.cholesky_solve(y, torch.linalg.cholesky(gram, upper=True), upper=True).T @ x
+        add_products(gram, x.T)
+        return [Equations(factorise(gram, strength), y, x) for strength in lambdas]
+
+    def make_ridge(self, weight: Tensor, coefficients: Tensor | None = None) -> Ridge:
+        """The map with these (T, D) weights that leaves the mean where it is."""
+        mean_x, mean_y = self.mean.split(self.sizes)
+        weight = weight.double()
+        return Ridge(weight, mean_y - weight @ mean_x, weight if coefficients is None else coefficients)
+
+    @property
+    def mean(self) -> Tensor:
+        """(D + T,) means of features and targets."""
+        if self._n_folded:
+            self._fold()
+            return self._mean
+        return self._find_rows_mean()
+
+    def kept(self) -> tuple[Tensor, Tensor] | None:
+        """Features (N, D) and targets (N, T) of all frames; None where there are more than D."""
+        return None if self._n_folded else (self._x[: self._n_rows], self._y[: self._n_rows])
 
     def spectrum(self) -> Spectrum:
         """The principal components of the features, with their sums of squares."""
+        mean = self.mean[: self.sizes[0]]
         if self._n_folded:
-            self._fold()
-            mean = self._mean
-            values, vectors = _factorise_gram(self._gram)
+            values, vectors = find_eigenvectors(self._gram)
         else:
-            rows = self._rows[: self._n_rows]
-            mean = rows.mean(0)
-            x = (rows - mean)[:, : self._sizes[0]]
-            values, vectors = _factorise_gram(x @ x.T)
+            x, _ = self._centre_rows()
+            values, vectors = find_eigenvectors(x @ x.T)
             # Eigenvectors over frames span those over features, but for what the null space would divide by 0.
             vectors = x.T @ (vectors / values.clamp(min=torch.finfo(values.dtype).tiny).sqrt())
         kept = values > values[-1] * len(values) * torch.finfo(values.dtype).eps
-        return Spectrum(values[kept].flip(0), vectors[:, kept].flip(1), mean[: self._sizes[0]])
+        return Spectrum(values[kept].flip(0), vectors[:, kept].flip(1), mean)
 
-    def _mean_and_cross(self) -> tuple[Tensor, Tensor]:
-        """Mean of features and targets (D + T,), and their centred products (D, T)."""
+    def _find_cross(self) -> Tensor:
+        """Centred products (D, T) of features and targets."""
         if self._n_folded:
             self._fold()
-            return self._mean, self._cross
-        rows = self._rows[: self._n_rows]
-        mean = rows.mean(0)
-        x, y = (rows - mean).split(self._sizes, dim=1)
-        return mean, (y.T @ x).T
+            return self._cross
+        x, y = self._centre_rows()
+        return (y.T @ x).T
+
+    def _find_rows_mean(self) -> Tensor:
+        """(D + T,) means of the kept rows, in double precision."""
+        if self._rows_mean is None:
+            self._rows_mean = torch.cat([kept[: self._n_rows].double().mean(0) for kept in (self._x, self._y)])
+        return self._rows_mean
+
+    def _centre_rows(self) -> tuple[Tensor, Tensor]:
+        """The kept rows less their means, (N, D) and (N, T)."""
+        mean_x, mean_y = self._find_rows_mean().split(self.sizes)
+        x, y = self._x[: self._n_rows], self._y[: self._n_rows]
+        return x - mean_x.to(x), (y - mean_y).to(x)
 
     def _fold(self) -> None:
         """Add the kept rows to the Gram matrix and the products, and forget them."""
         if not self._n_rows:
             return
-        features, n, count = self._sizes[0], self._n_rows, self.count
-        mean = self._rows[:n].mean(0)
+        features, n, count = self.sizes[0], self._n_rows, self.count
+        mean = self._find_rows_mean()
         if not self._n_folded:
             self._mean = torch.zeros_like(mean)
-            self._gram, self._cross = mean.new_zeros(features, features), mean.new_zeros(self._sizes)
+            self._gram, self._cross = (self._x.new_zeros(features, size) for size in self.sizes)
         shift = mean - self._mean
-        self._rows[:n] -= mean
         # One more row makes up for the difference between the two means.
-        self._rows[n] = shift * math.sqrt(self._n_folded * n / count)
-        x, y = self._rows[: n + 1].split(self._sizes, dim=1)
-        _add_products(self._gram, x)
+        for kept, mean_of, shift_of in zip(
+            (self._x, self._y), *(s.split(self.sizes) for s in (mean, shift)), strict=True
+        ):
+            kept[:n] -= mean_of.to(kept)
+            kept[n] = shift_of * math.sqrt(self._n_folded * n / count)
+        x, y = self._x[: n + 1], self._y[: n + 1].to(self.dtype)
+        add_products(self._gram, x)
         self._cross += (y.T @ x).T  # a third of the time of x.T @ y
         self._mean = self._mean + shift * (n / count)
         self._n_folded, self._n_rows = count, 0
