@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from importlib import import_module
 
 from lightning_pose.errors import PoseError
-from lightning_pose.runs.signals import STOPPING, interrupt_on
+from lightning_pose.signals import STOPPING, interrupt_on
 
 __all__ = ["main"]
 

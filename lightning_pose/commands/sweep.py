@@ -87,7 +87,7 @@ def main(argv: list[str]) -> int:
     own, overrides = _split_arguments(argv)
     args = _build_sweep_parser().parse_args(own)
     # Imported here, so that `--help` does not wait for them.
-    from lightning_pose.runs.signals import delay_interrupts
+    from lightning_pose.signals import delay_interrupts
     from lightning_pose.studies.figure_spec import parse_figure_spec
     from lightning_pose.sweeps.parent_run import close_parent, open_parent
     from lightning_pose.sweeps.plan import read_plan

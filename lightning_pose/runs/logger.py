@@ -24,10 +24,10 @@ from lightning_pose.paths import STORE_VARIABLE, default_tracking_uri
 from lightning_pose.runs.client import BufferedClient, is_unreachable, wait_while_locked
 from lightning_pose.runs.process import has_owner_died, process_tags
 from lightning_pose.runs.reader import mask_passwords, read_pages
-from lightning_pose.runs.signals import delay_interrupts
 from lightning_pose.runs.store import prepare_store, sqlite_file
 from lightning_pose.runs.tags import PARENT_TAG
 from lightning_pose.scenes.images import read_rgb
+from lightning_pose.signals import delay_interrupts
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient

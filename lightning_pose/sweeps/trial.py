@@ -26,8 +26,8 @@ from lightning_pose.features.keypoint_statistics import measure_keypoints
 from lightning_pose.models.parts.symmetric import shared_factors
 from lightning_pose.runs.checkpoints import BestCheckpoint, checkpoint_folder, run_logger
 from lightning_pose.runs.process import process_tags
-from lightning_pose.runs.signals import delay_interrupts
 from lightning_pose.runs.tags import CURVES, METRICS, PARENT_TAG, REASON, RUN
+from lightning_pose.signals import delay_interrupts
 from lightning_pose.sweeps.base_config import ParsedConfig, open_keypoint_data
 from lightning_pose.sweeps.plan import Plan
 from lightning_pose.sweeps.space import Settings, draw_values

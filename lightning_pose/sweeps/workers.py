@@ -31,8 +31,8 @@ from optuna.storages import RDBStorage, fail_stale_trials
 from optuna.trial import TrialState
 
 from lightning_pose.runs.process import process_name
-from lightning_pose.runs.signals import STOPPING, interrupt_on
 from lightning_pose.runs.tags import PROCESS
+from lightning_pose.signals import STOPPING, interrupt_on
 from lightning_pose.sweeps.plan import Plan
 from lightning_pose.sweeps.storage import lock_study
 from lightning_pose.sweeps.study import count_waiting, is_grid, load_study, open_storage, queue_again, recover_trials

@@ -10,7 +10,7 @@ import pytest
 
 from lightning_pose import __main__
 from lightning_pose.__main__ import main
-from lightning_pose.runs.signals import STOPPING, delay_interrupts, interrupt_on
+from lightning_pose.signals import STOPPING, delay_interrupts, interrupt_on
 from tests.helpers import FailAt, Workplace
 
 
