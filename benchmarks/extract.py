@@ -1,6 +1,6 @@
 """Filling the feature cache: two workers against one, and a CNN's features against a bare torch loop.
 
-    python -m benchmarks.extract [--frames 96] [--rounds 5] [--root DIR]
+    python -m benchmarks.extract [--frames 300] [--rounds 5] [--root DIR]
 
 Images are frames of a synthetic room, 640x480, or of `--root`. Each measurement fills an empty cache, as `extract`
 does: it reads, hashes and decodes files, extracts, and writes records. Two workers should be 1.8 times as fast as one
@@ -28,6 +28,7 @@ from lightning_pose.scenes.synthetic import render_room
 
 SUFFIXES = {".jpg", ".jpeg", ".png"}
 SPEED_UP, OVERHEAD = 1.8, 1.05
+FRAMES = 300
 
 
 def list_images(root: Path, count: int) -> list[Path]:
@@ -67,7 +68,7 @@ def run_bare(cnn: CNN, network: torch.nn.Module, paths: list[Path]) -> list[torc
     return found
 
 
-def measure(options: Options, frames: int = 96) -> Iterator[Measurement]:
+def measure(options: Options, frames: int = FRAMES) -> Iterator[Measurement]:
     """Two rows of workers, SURF and CNN, and one of the CNN against the bare loop."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
@@ -95,7 +96,7 @@ def measure(options: Options, frames: int = 96) -> Iterator[Measurement]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--root", help="folder of images (default: a synthetic room)")
-    parser.add_argument("--frames", type=int, default=96)
+    parser.add_argument("--frames", type=int, default=FRAMES)
     parser.add_argument("--rounds", type=int, default=5)
     args = parser.parse_args()
     print(format_table([*measure(Options(args.root, rounds=args.rounds), args.frames)]))

@@ -31,6 +31,8 @@ class FeatureExtractor(ABC):
     - `primary`: the name of the array that the networks read;
     - `settings`: everything that changes the stored arrays, in plain types (it keys the cache);
     - `version`: of the computation, raised by one when the same settings give other arrays (it keys the cache too);
+    - `holds_interpreter`: only where extraction is many short operations, among which Python's threads wait for each
+      other; processes are then used on many images;
     - `feature_shape`: the shape that `features` returns for one image, and `dtype` if it is not float32;
     - `extract`: the computation, deterministic, for images that may differ in size;
     - `features`: only where the networks do not read the stored primary array as it is.
@@ -42,6 +44,7 @@ class FeatureExtractor(ABC):
     primary: ClassVar[str]
     dtype: ClassVar[type[np.generic]] = np.float32
     version: ClassVar[int] = 1
+    holds_interpreter: ClassVar[bool] = False
 
     @property
     def name(self) -> str:

@@ -54,8 +54,8 @@ class FeatureCache:
     killed leaves no partial file; each file has a checksum, and a damaged file is written anew. Several processes may
     fill one cache at the same time and share the work.
 
-    `extractor.extract` is called from several threads at a time, with up to 8 images each. (With SURF on two cores,
-    processes were a sixth faster than threads once they ran, but took as long to start as 200 images to extract.)
+    `extractor.extract` is called from several threads at a time, with up to 8 images each; of extractors that hold the
+    interpreter, and many images, from processes that are forked off this one.
 
     Args:
         extractor: what computes the records.
@@ -81,7 +81,7 @@ class FeatureCache:
 
         Args:
             paths: image files; equal images are extracted once.
-            workers: threads to extract with; by default one for each core this process may use.
+            workers: threads or processes to extract with; by default one for each core this process may use.
             progress: show a bar on stderr while extracting.
 
         Raises:
@@ -89,7 +89,7 @@ class FeatureCache:
             ImageError: some images cannot be read; all others have been saved before.
             CacheError: the cache cannot be written or read.
         """
-        return self._visit(paths, lambda numbers, record: None, workers, progress)
+        return self._visit(paths, None, workers, progress)
 
     def features(self, paths: Sequence[ImagePath], workers: int | None = None, progress: bool = True) -> np.ndarray:
         """The features that networks read, (len(paths), *extractor.feature_shape) of `extractor.dtype`.
@@ -135,10 +135,14 @@ class FeatureCache:
             self._visit(chunk, put, workers, progress=False)
             yield from (found[number] for number in range(len(chunk)))
 
-    def _visit(self, paths: Sequence[ImagePath], visit: Visit, workers: int | None, progress: bool) -> FillReport:
+    def _visit(
+        self, paths: Sequence[ImagePath], visit: Visit | None, workers: int | None, progress: bool
+    ) -> FillReport:
         """Call `visit` with the record of every distinct image, read from disk or else extracted and saved."""
         if workers is not None and workers < 1:
-            raise ConfigError(f"workers is {workers}; give the number of threads to extract with, 1 or more")
+            raise ConfigError(
+                f"workers is {workers}; give the number of threads or processes to extract with, 1 or more"
+            )
         job = FillJob(self.extractor, self.folder, paths, visit, workers or count_cores())
         job.read()
         started = time.perf_counter()

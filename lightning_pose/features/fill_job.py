@@ -1,4 +1,4 @@
-"""One pass of the feature cache over images: find their records on disk, extract what is missing, with threads."""
+"""One pass of the feature cache over images: find their records on disk, extract what is missing, on all cores."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ import logging
 import os
 import random
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -19,8 +20,9 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
-from lightning_pose.errors import ImageError
+from lightning_pose.errors import CacheError, ImageError
 from lightning_pose.features.base import FeatureExtractor, Record
+from lightning_pose.features.forked_pool import ForkedPool, can_fork
 from lightning_pose.features.record_files import DamagedError, read_record, write_record
 from lightning_pose.scenes.images import decode_image, read_bytes
 
@@ -32,6 +34,9 @@ Visit = Callable[[list[int], Record], None]
 
 BATCH = 8
 """Images per call of `extract`: enough for a GPU, few enough to spread over the cores."""
+
+FORKED = 64
+"""Fewer images are extracted by threads: processes have to be started, which takes as long as some of them."""
 
 log = logging.getLogger("lightning_pose")
 
@@ -46,6 +51,20 @@ def count_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+class Extracted(NamedTuple):
+    """What came of a batch.
+
+    Attributes:
+        computed: keys of the images that were extracted.
+        bad: image number to the error of reading the image.
+        apart: whether no record was visited.
+    """
+
+    computed: set[str]
+    bad: dict[int, ImageError]
+    apart: bool
+
+
 @dataclass
 class FillJob:
     """One pass over some images: `read` the records that the cache holds, then `extract` the others.
@@ -54,8 +73,8 @@ class FillJob:
         extractor: computes the records.
         folder: the cache's folder for this extractor.
         paths: image files.
-        visit: called with each record.
-        workers: number of threads.
+        visit: called with each record; None where records are only to be in the cache.
+        workers: number of threads, or processes.
         numbers: content key to the numbers of all images with that content.
         missing, damaged: keys that must be extracted.
         bad: image number to the error of reading the image.
@@ -65,7 +84,7 @@ class FillJob:
     extractor: FeatureExtractor
     folder: Path
     paths: Sequence[ImagePath]
-    visit: Visit
+    visit: Visit | None
     workers: int
     numbers: dict[str, list[int]] = field(default_factory=dict)
     missing: set[str] = field(default_factory=set)
@@ -84,23 +103,48 @@ class FillJob:
         self.missing = {key for key, there in zip(self.numbers, held, strict=True) if not there} - self.damaged
 
     def extract(self, progress: bool) -> None:
-        """Extract, save and visit all that is missing or damaged, in batches spread over the threads."""
+        """Extract, save and visit all that is missing or damaged, in batches spread over threads or processes.
+
+        Raises:
+            CacheError: a process was killed, as happens where memory is short.
+        """
         todo = [*self.missing, *self.damaged]
         random.SystemRandom().shuffle(todo)  # so that processes that fill one cache rarely extract the same image
         size = min(BATCH, -(-len(todo) // self.workers))
         batches = [todo[start : start + size] for start in range(0, len(todo), size)]
-        workers = min(self.workers, len(batches))
-        with make_extraction_bar(progress) as bar, _set_inner_threads(max(1, self.workers // workers)):
+        with self._start(batches) as futures, make_extraction_bar(progress) as bar:
             task = bar.add_task(f"{self.extractor.name} features", total=len(todo))
-            pool = ThreadPoolExecutor(workers)
+            batch_of = dict(zip(futures, batches, strict=True))
+            for done in as_completed(futures):
+                self._take(batch_of[done], done.result())
+                bar.advance(task, len(batch_of[done]))
+
+    @contextmanager
+    def _start(self, batches: list[list[str]]) -> Iterator[list[Future[Extracted]]]:
+        """Start to extract batches; after an error or Ctrl-C, finish only those under way."""
+        workers, images = min(self.workers, len(batches)), sum(map(len, batches))
+        forks = self.extractor.holds_interpreter and workers > 1 and images >= FORKED and can_fork()
+        fork = ForkedPool(replace(self, visit=None)._extract_batch, workers) if forks else None
+        with fork or ThreadPoolExecutor(workers) as pool, _set_inner_threads(max(1, self.workers // workers)):
             try:
-                futures = {pool.submit(self._extract_batch, batch): batch for batch in batches}
-                for done in as_completed(futures):
-                    self.computed += len(done.result() - self.damaged)
-                    self.redone += len(done.result() & self.damaged)
-                    bar.advance(task, len(futures[done]))
+                # Processes start here, before the bar's thread runs, which may hold the terminal.
+                yield fork.start(batches) if fork else [pool.submit(self._extract_batch, batch) for batch in batches]
+            except BrokenExecutor as error:
+                raise CacheError(
+                    "a process that extracts features was killed; run the command again, which goes on from here, "
+                    "with fewer data.workers if memory is short"
+                ) from error
             finally:
-                pool.shutdown(cancel_futures=True)  # after an error or Ctrl-C, finish only the batches under way
+                pool.shutdown(cancel_futures=True)
+
+    def _take(self, batch: list[str], extracted: Extracted) -> None:
+        """Count what was extracted, and visit the records of other processes."""
+        self.computed += len(extracted.computed - self.damaged)
+        self.redone += len(extracted.computed & self.damaged)
+        self.bad |= extracted.bad
+        for key in batch if self.visit is not None and extracted.apart else ():
+            if self.numbers[key][0] not in extracted.bad and not self._visit_record(key):
+                self._extract_batch([key])  # something has deleted or damaged it meanwhile
 
     def _compute_key(self, number: int) -> str | None:
         """Digest of an image file's content; None if it cannot be read, which is noted in `bad`."""
@@ -129,25 +173,28 @@ class FillJob:
             return False
         if record is None:
             return False
-        self.visit(self.numbers[key], record)
+        if self.visit is not None:
+            self.visit(self.numbers[key], record)
         return True
 
-    def _extract_batch(self, batch: list[str]) -> set[str]:
-        """Extract one batch; returns the keys that were computed here."""
+    def _extract_batch(self, batch: list[str]) -> Extracted:
+        """Extract one batch, but for what another process has saved meanwhile."""
         images: dict[str, np.ndarray] = {}
+        bad: dict[int, ImageError] = {}
         for key in batch:
             if key in self.missing and self._visit_record(key):
-                continue  # another process has saved it meanwhile
+                continue
             number = self.numbers[key][0]
             try:
                 images[key] = self._read_image(self.paths[number], key)
             except ImageError as error:
-                self.bad[number] = error
+                bad[number] = error
         records = self.extractor.extract(list(images.values())) if images else []
         for key, record in zip(images, records, strict=True):
             write_record(self._record_file(key), record, self._record_owner(key))
-            self.visit(self.numbers[key], record)
-        return set(images)
+            if self.visit is not None:
+                self.visit(self.numbers[key], record)
+        return Extracted(set(images), bad, self.visit is None)
 
     def _read_image(self, path: ImagePath, key: str) -> np.ndarray:
         """Read an image whose content must still have this key."""

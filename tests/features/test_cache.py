@@ -6,6 +6,7 @@ import json
 import logging
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -21,6 +22,7 @@ from lightning_pose.errors import CacheError, ConfigError, ImageError
 from lightning_pose.features import fill_job
 from lightning_pose.features.base import Record
 from lightning_pose.features.cache import FeatureCache
+from lightning_pose.features.forked_pool import can_fork
 from lightning_pose.features.opencv import BRIEF
 from lightning_pose.features.record_files import read_record
 from tests.features.helpers import ColorMeans, write_images
@@ -337,3 +339,56 @@ def test_a_record_put_in_another_image_s_place_is_extracted_again(tmp_path: Path
     assert cache.fill(paths, progress=False).redone == 1
     np.testing.assert_array_equal(cache.features(paths, progress=False), expected(2))
     assert cache.fill(paths, progress=False).redone == 0
+
+
+class HeldColorMeans(ColorMeans):
+    """Is taken to hold the interpreter, so that processes extract; `deadly` kills them."""
+
+    holds_interpreter = True
+    deadly = False
+
+    def extract(self, images: Sequence[np.ndarray]) -> list[Record]:
+        if self.deadly:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().extract(images)
+
+
+@pytest.fixture
+def forked(monkeypatch: pytest.MonkeyPatch) -> None:
+    if not can_fork():
+        pytest.skip("processes cannot be forked here")
+    monkeypatch.setattr(fill_job, "FORKED", 4)
+
+
+@pytest.mark.usefixtures("forked")
+def test_processes_extract_what_threads_do(tmp_path: Path) -> None:
+    paths = write_images(tmp_path / "images", 30)
+    extractor = HeldColorMeans()
+    cache = FeatureCache(extractor, tmp_path / "cache")
+    np.testing.assert_array_equal(cache.features(paths, workers=3, progress=False), expected(30))
+    assert not extractor.seen, "this process has extracted nothing"
+    cache.fill(paths[:20], workers=2, progress=False)
+    records_in(tmp_path / "cache")[0].write_bytes(b"damaged")
+    report = FeatureCache(extractor, tmp_path / "cache").fill(paths, workers=2, progress=False)
+    assert (report.total, report.computed, report.cached, report.redone) == (30, 0, 29, 1)
+
+
+@pytest.mark.usefixtures("forked")
+def test_processes_count_and_save_all_but_bad_images(tmp_path: Path) -> None:
+    paths = write_images(tmp_path / "images", 30)
+    paths[7].write_bytes(b"no image")
+    cache = FeatureCache(HeldColorMeans(), tmp_path / "cache")
+    with pytest.raises(ImageError, match=r"007\.png"):
+        cache.fill(paths, workers=2, progress=False)
+    assert len(records_in(tmp_path / "cache")) == 29
+    good = paths[:7] + paths[8:]
+    assert cache.fill(good, workers=2, progress=False).cached == 29
+
+
+@pytest.mark.usefixtures("forked")
+def test_a_killed_process_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    paths = write_images(tmp_path / "images", 30)
+    extractor = HeldColorMeans()
+    monkeypatch.setattr(extractor, "deadly", True)
+    with pytest.raises(CacheError, match=r"was killed; run the command again, .* with fewer data.workers"):
+        FeatureCache(extractor, tmp_path / "cache").fill(paths, workers=2, progress=False)

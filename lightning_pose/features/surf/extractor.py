@@ -57,6 +57,7 @@ class SURF(LocalExtractor):
     """
 
     descriptor_dim: ClassVar[int] = 64
+    holds_interpreter: ClassVar[bool] = True
 
     def __init__(
         self, n_features: int = 300, upright: bool = True, threshold: float = 0.0, with_geometry: bool = False
