@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from lightning import Trainer
 from lightning.pytorch.plugins.io import TorchCheckpointIO
+from torch import Tensor
 
 from lightning_pose.checkpoint import check_file
 from lightning_pose.errors import CheckpointError
@@ -41,6 +42,7 @@ class CheckpointFiles(TorchCheckpointIO):
         super().__init__()
         self.before_write: Callable[[], object] = lambda: None
         self._held: dict[Path, dict[str, Any]] = {}
+        self._spare: dict[Path, dict[str, Any]] = {}  # earlier copies, whose memory the next ones use
         self._may_hold = False
         self._pace = Pace()
 
@@ -51,14 +53,13 @@ class CheckpointFiles(TorchCheckpointIO):
             CheckpointError: the disk is full, or the folder cannot be written; the old file is still there.
         """
         file = Path(path)
-        self._held.pop(file, None)
+        earlier = self._held.pop(file, None)
         if not self._may_hold:
             _write(checkpoint, file)
         elif self._pace.is_due:
-            self._held[file] = checkpoint
-            self.flush()
-        else:
-            self._held[file] = copy.deepcopy(checkpoint)  # training goes on with its tensors
+            self._write_all({**self._take_held(), file: checkpoint})
+        else:  # training goes on with its tensors
+            self._held[file] = _copy_values(checkpoint, earlier or self._spare.pop(file, None))
 
     @contextmanager
     def hold(self) -> Iterator[None]:
@@ -75,12 +76,21 @@ class CheckpointFiles(TorchCheckpointIO):
         Raises:
             CheckpointError: as `save_checkpoint`.
         """
-        held, self._held = self._held, {}
+        held = self._take_held()
         if held:
-            with self._pace.measure():
-                self.before_write()
-                for file, checkpoint in held.items():
-                    _write(checkpoint, file)
+            self._write_all(held)
+
+    def _take_held(self) -> dict[Path, dict[str, Any]]:
+        """What is kept, whose memory the next copies use once it is written."""
+        held, self._held = self._held, {}
+        self._spare |= held
+        return held
+
+    def _write_all(self, checkpoints: dict[Path, dict[str, Any]]) -> None:
+        with self._pace.measure():
+            self.before_write()
+            for file, checkpoint in checkpoints.items():
+                _write(checkpoint, file)
 
     def load_checkpoint(self, path: str | Path, *args: Any, **kwargs: Any) -> dict[str, Any]:
         """Read a checkpoint.
@@ -91,6 +101,26 @@ class CheckpointFiles(TorchCheckpointIO):
         if Path(path).is_file():
             check_file(Path(path))
         return super().load_checkpoint(path, *args, **kwargs)
+
+
+def _copy_values(value: Any, earlier: Any) -> Any:
+    """A copy of a checkpoint, in the tensors of an earlier one where they fit: new memory takes longer than copying."""
+    if isinstance(value, Tensor):
+        if isinstance(earlier, Tensor) and _get_kind(value) == _get_kind(earlier):
+            return earlier.copy_(value.detach())
+        return value.detach().clone()
+    if isinstance(value, dict):
+        known, copied = earlier if isinstance(earlier, dict) else {}, copy.copy(value)
+        copied.update({key: _copy_values(each, known.get(key)) for key, each in value.items()})
+        return copied
+    if isinstance(value, list):
+        known = earlier if isinstance(earlier, list) and len(earlier) == len(value) else [None] * len(value)
+        return [_copy_values(*pair) for pair in zip(value, known, strict=True)]
+    return copy.deepcopy(value)
+
+
+def _get_kind(tensor: Tensor) -> tuple[torch.Size, torch.dtype, torch.device]:
+    return tensor.shape, tensor.dtype, tensor.device
 
 
 def _write(checkpoint: dict[str, Any], file: Path) -> None:

@@ -8,10 +8,10 @@ from contextlib import contextmanager
 
 __all__ = ["Pace"]
 
-SHARE = 40
+SHARE = 100
 """So many times as long as the last write took is the time until the next one."""
 
-LONGEST_S = 5.0
+LONGEST_S = 20.0
 """The longest time until the next one: what a process that is killed can lose."""
 
 

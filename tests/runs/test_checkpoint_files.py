@@ -124,6 +124,29 @@ def test_of_what_is_held_the_newest_is_written(tmp_path: Path) -> None:
     assert read_checkpoint(tmp_path / "last.ckpt")["state_dict"]["weight"].tolist() == [2]
 
 
+def test_what_is_held_is_a_copy_in_the_memory_of_an_earlier_one(tmp_path: Path) -> None:
+    files, weight = make_busy_files(), torch.zeros(3)
+    ways: list[int] = []
+    for number in range(6):
+        weight.fill_(number)
+        state = {"weight": weight, "steps": [weight.clone(), {"number": number}]}
+        with files.hold():
+            files.save_checkpoint({"lightning_pose": {}, "state_dict": state}, tmp_path / "last.ckpt")
+        weight.fill_(-1)  # training goes on
+        (held,) = files._held.values()
+        ways.append(held["state_dict"]["weight"].data_ptr())
+        if number == 3:
+            files.flush()
+            files._pace._next = float("inf")
+            assert read_checkpoint(tmp_path / "last.ckpt")["state_dict"]["weight"].tolist() == [3, 3, 3]
+    files.flush()
+    read = read_checkpoint(tmp_path / "last.ckpt")["state_dict"]
+    assert read["weight"].tolist() == read["steps"][0].tolist() == [5, 5, 5]
+    assert read["steps"][1] == {"number": 5}
+    assert len(set(ways)) == 1
+    assert weight.data_ptr() not in ways
+
+
 def test_outside_hold_a_checkpoint_is_written_at_once(tmp_path: Path) -> None:
     make_busy_files().save_checkpoint(SMALL, tmp_path / "own.ckpt")
     assert read_checkpoint(tmp_path / "own.ckpt")["state_dict"]["weight"].tolist() == [1]
