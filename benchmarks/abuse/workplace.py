@@ -171,4 +171,4 @@ def make_workplace(folder: Path, only: Sequence[str] = ()) -> Workplace:
     (folder / "mlruns").mkdir(parents=True)
     MlflowClient(f"sqlite:///{folder / 'empty.db'}").search_experiments()  # making one takes seconds
     shutil.copy(folder / "empty.db", folder / "mlruns" / "mlflow.db")
-    return Workplace(folder, render_room(folder / "room", frames=60, size=(320, 240)), tuple(only))
+    return Workplace(folder, render_room(folder / "room", frames=90, size=(320, 240)), tuple(only))
