@@ -32,8 +32,8 @@ from lightning_pose.paths import default_tracking_uri
 from lightning_pose.runs.checkpoints import BestCheckpoint, LastCheckpoint, checkpoint_folder
 from lightning_pose.runs.clock import TrainingClock
 from lightning_pose.runs.epoch_bar import EpochBar
+from lightning_pose.runs.last_run import find_last_run
 from lightning_pose.runs.lightning_messages import filter_messages
-from lightning_pose.runs.logger import find_last_run
 from lightning_pose.runs.recorder import RunRecorder
 from lightning_pose.runs.resume import check_architecture, check_resumable, check_same_settings, is_complete, read_seed
 from lightning_pose.scenes.trajectory_files import write_sequences

@@ -18,7 +18,8 @@ from lightning_pose.evaluation.table import print_results, results_markdown
 from lightning_pose.models.base import Pose, PoseModule
 from lightning_pose.models.parts.poses import Located
 from lightning_pose.runs.checkpoints import checkpoint_folder, run_logger
-from lightning_pose.runs.logger import MLflowLogger, log_localizer
+from lightning_pose.runs.logged_model import log_localizer
+from lightning_pose.runs.logger import MLflowLogger
 from lightning_pose.runs.tags import NOTE
 from lightning_pose.scenes.scene import Frame
 from lightning_pose.scenes.trajectory_files import write_sequences

