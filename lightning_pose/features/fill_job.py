@@ -128,7 +128,7 @@ class FillJob:
         with fork or ThreadPoolExecutor(workers) as pool, _set_inner_threads(max(1, self.workers // workers)):
             try:
                 # Processes start here, before the bar's thread runs, which may hold the terminal.
-                yield fork.start(batches) if fork else [pool.submit(self._extract_batch, batch) for batch in batches]
+                yield _start_forked(fork, batches) if fork else [pool.submit(self._extract_batch, b) for b in batches]
             except BrokenExecutor as error:
                 raise CacheError(
                     "a process that extracts features was killed; run the command again, which goes on from here, "
@@ -202,6 +202,20 @@ class FillJob:
         if hash_bytes(data) != key:
             raise ImageError(f"{path} changed while it was read; run again when nothing writes to it")
         return decode_image(data, path, color=self.extractor.color == "rgb")
+
+
+def _start_forked(pool: ForkedPool[list[str], Extracted], batches: list[list[str]]) -> list[Future[Extracted]]:
+    """Start the processes of a pool, with all batches to do.
+
+    Raises:
+        CacheError: they cannot be started.
+    """
+    try:
+        return pool.start(batches)
+    except OSError as error:
+        raise CacheError(
+            f"cannot start processes to extract features ({error.strerror}); set data.workers to 1"
+        ) from error
 
 
 @contextmanager

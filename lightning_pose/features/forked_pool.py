@@ -47,12 +47,23 @@ class ForkedPool(ProcessPoolExecutor, Generic[A, R]):
         super().__init__(workers, multiprocessing.get_context("fork"), _prepare_worker, (work, os.getpid()))
 
     def start(self, arguments: Iterable[A]) -> list[Future[R]]:
-        """Call the function with each of the arguments."""
+        """Call the function with each of the arguments.
+
+        Raises:
+            OSError: no process can be started, as memory or their number is limited.
+        """
+        others = multiprocessing.active_children()
         # A process is forked by calls that ignore exceptions, and so Ctrl-C.
         with delay_interrupts(), warnings.catch_warnings():
             # Python warns that threads of this process are not in the forked ones: see `_prepare_worker`.
             warnings.filterwarnings("ignore", ".*fork.*", DeprecationWarning)
-            return [self.submit(_call_work, argument) for argument in arguments]
+            try:
+                return [self.submit(_call_work, argument) for argument in arguments]
+            except OSError:
+                for started in multiprocessing.active_children():
+                    if started not in others:
+                        started.terminate()
+                raise
 
 
 def _prepare_worker(work: Callable[[Any], Any], parent: int) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import multiprocessing
 import os
 import shutil
 import signal
@@ -392,3 +393,22 @@ def test_a_killed_process_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(extractor, "deadly", True)
     with pytest.raises(CacheError, match=r"was killed; run the command again, .* with fewer data.workers"):
         FeatureCache(extractor, tmp_path / "cache").fill(paths, workers=2, progress=False)
+
+
+@pytest.mark.usefixtures("forked")
+def test_processes_that_cannot_start_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    paths, fork, started = write_images(tmp_path / "images", 30), os.fork, list[int]()
+
+    def fork_once() -> int:
+        if started:
+            raise BlockingIOError(11, "Resource temporarily unavailable")
+        started.append(1)
+        return fork()
+
+    monkeypatch.setattr(os, "fork", fork_once)
+    message = r"cannot start processes .* \(Resource temporarily unavailable\); set data.workers to 1"
+    with pytest.raises(CacheError, match=message):
+        FeatureCache(HeldColorMeans(), tmp_path / "cache").fill(paths, workers=2, progress=False)
+    for child in multiprocessing.active_children():
+        child.join(timeout=30)
+    assert not multiprocessing.active_children()
