@@ -53,7 +53,7 @@ static int fd_fails(int fd) {
   snprintf(link, sizeof link, "/proc/self/fd/%d", fd);
   ssize_t size = readlink(link, path, sizeof path - 1);
   errno = before;
-  if (size <= 0) return 0;
+  if (size <= 0 || path[0] != '/') return 0; /* "pipe:[1234]" is on no disk */
   path[size] = 0;
   return path_fails(path);
 }

@@ -61,9 +61,12 @@ def main(argv: list[str]) -> int:
 
 
 def _compare_poses(scene: Scene) -> PoseCheck:
-    from lightning_pose.mapping.pose_check import check_poses  # not for `--help`
+    from threadpoolctl import threadpool_limits  # not for `--help`
 
-    return check_poses(scene)
+    from lightning_pose.mapping.pose_check import check_poses
+
+    with threadpool_limits(1, user_api="blas"):  # it has a thread a core, and more would wait for each other
+        return check_poses(scene)
 
 
 def _describe_drop(scene: Scene) -> list[str]:
