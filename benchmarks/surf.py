@@ -25,7 +25,7 @@ from benchmarks.measurement import Goal, Measurement, Options
 from lightning_pose.features.surf import SURF
 
 SUFFIXES = {".jpg", ".jpeg", ".png"}
-LIMIT = 0.5
+LIMIT = 0.21
 """Of SIFT's time; OpenCV's own SURF, which its packages lack, takes 0.49 of it."""
 
 

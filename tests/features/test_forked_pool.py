@@ -29,6 +29,19 @@ def test_it_works_in_other_processes_with_one_thread_each() -> None:
     assert not multiprocessing.active_children()
 
 
+def test_threads_of_the_parent_are_not_waited_for() -> None:
+    """A forked process has none of them; work that torch shares out would wait for them without end."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        matrix = torch.ones(600, 600)
+        expected = float((matrix @ matrix).sum())  # starts the threads
+        with ForkedPool(lambda number: float((matrix @ matrix).sum()), 2) as pool:
+            assert [started.result(timeout=60) for started in pool.start(range(3))] == [expected] * 3
+    finally:
+        torch.set_num_threads(before)
+
+
 def test_an_error_is_raised_as_it_is() -> None:
     def fail(number: int) -> int:
         if number == 2:

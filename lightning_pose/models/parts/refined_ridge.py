@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import torch
 from torch import Tensor
 
+from lightning_pose.models.parts.chunks import split_rows
 from lightning_pose.models.parts.ridge import Moments, Ridge
 
 __all__ = ["Batches", "solve_ridges"]
 
 Batches = Callable[[], Iterable[tuple[Tensor, Tensor]]]
 """Features (B, D) and targets (B, T) of all frames, batch by batch, from the first one at each call."""
-
-CHUNK = 64
-"""Frames whose features in double precision fit a processor's cache."""
 
 SMALL = 1e-5
 """A correction below this share of the weights is the last one: it leaves about its square, and weights are kept in
@@ -77,16 +75,17 @@ def _find_residuals(moments: Moments, answers: Tensor, lambdas: Sequence[float],
     weight = _find_weights(moments, answers).flatten(0, 1)  # (L * T, D)
     offset = (weight @ mean_x).view(len(answers), -1) - mean_y
     kept = moments.kept()
-    errors, total, products = [], torch.zeros_like(weight[:, :1]), torch.zeros_like(weight)
-    for x, y in _split(batches() if kept is None else [kept]):
+    products, total = torch.zeros_like(weight), torch.zeros_like(weight[:, :1])
+    error = products
+    for features, targets in batches() if kept is None else [kept]:
         # (L * T, B): the targets less what the weights predict, both around their means
-        error = ((y.double().T + offset[..., None]).flatten(0, 1)).addmm_(weight, x.T, alpha=-1)
-        if kept is None:
-            products.addmm_(error, x)
-            total += error.sum(1, keepdim=True)
-        else:
-            errors.append(error)
-    found = torch.cat(errors, dim=1) if errors else products.addmm_(total, mean_x[None], alpha=-1)
+        error = (targets.double().T + offset[..., None]).flatten(0, 1)
+        for rows, x in split_rows(features):
+            part = error[:, rows].addmm_(weight, x.T, alpha=-1)
+            if kept is None:
+                products.addmm_(part, x)
+        total += error.sum(1, keepdim=True)
+    found = error if kept is not None else products.addmm_(total, mean_x[None], alpha=-1)
     found = found.view(len(answers), -1, found.shape[1]).mT
     return found - torch.tensor(lambdas).to(answers).view(-1, 1, 1) * answers
 
@@ -98,19 +97,7 @@ def _find_weights(moments: Moments, answers: Tensor) -> Tensor:
         return answers.mT
     # Of centred features, whose sum over frames is zero.
     centred = (answers - answers.mean(1, keepdim=True)).mT.flatten(0, 1)  # (L * T, N)
-    weight, done = centred.new_zeros(len(centred), moments.sizes[0]), 0
-    for x, _ in _split([kept]):
-        weight.addmm_(centred[:, done : done + len(x)], x)
-        done += len(x)
+    weight = centred.new_zeros(len(centred), moments.sizes[0])
+    for rows, x in split_rows(kept[0]):
+        weight.addmm_(centred[:, rows], x)
     return weight.view(len(answers), -1, moments.sizes[0])
-
-
-def _split(batches: Iterable[tuple[Tensor, Tensor]]) -> Iterator[tuple[Tensor, Tensor]]:
-    """Chunks of batches, with features in double precision in memory that the next chunk uses again."""
-    buffer = torch.empty(0)
-    for whole in batches:
-        rows = CHUNK if whole[0].is_cpu else len(whole[0])
-        if len(buffer) < rows:
-            buffer = whole[0].new_empty(rows, whole[0].shape[1], dtype=torch.float64)
-        for x, y in zip(*(part.split(rows) for part in whole), strict=True):
-            yield buffer[: len(x)].copy_(x), y

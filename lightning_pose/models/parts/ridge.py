@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from lightning_pose.errors import ConfigError
+from lightning_pose.models.parts.chunks import find_mean
 from lightning_pose.models.parts.symmetric import Solve, add_products, factorise, find_eigenvectors
 
 __all__ = ["Equations", "Moments", "Ridge", "Spectrum"]
@@ -212,7 +213,7 @@ class Moments:
     def _find_rows_mean(self) -> Tensor:
         """(D + T,) means of the kept rows, in double precision."""
         if self._rows_mean is None:
-            self._rows_mean = torch.cat([kept[: self._n_rows].double().mean(0) for kept in (self._x, self._y)])
+            self._rows_mean = torch.cat([find_mean(kept[: self._n_rows]) for kept in (self._x, self._y)])
         return self._rows_mean
 
     def _centre_rows(self) -> tuple[Tensor, Tensor]:
