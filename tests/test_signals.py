@@ -74,7 +74,7 @@ def test_signals_wait_for_the_end_of_a_write() -> None:
 
 
 def test_a_closed_terminal_closes_the_run(workplace: Workplace, capsys: pytest.CaptureFixture[str]) -> None:
-    stopper = ["--trainer.callbacks+", "tests.runs.test_signals.HangUpAt", "--trainer.callbacks.epoch", "1"]
+    stopper = ["--trainer.callbacks+", "tests.test_signals.HangUpAt", "--trainer.callbacks.epoch", "1"]
     assert workplace.run("fit", "--trainer.max_epochs", "1000", *stopper) == 128 + signal.SIGHUP
     (run,) = workplace.runs()
     assert run.info.status == "KILLED"

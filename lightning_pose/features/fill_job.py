@@ -13,16 +13,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
-import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
 from lightning_pose.errors import CacheError, ImageError
 from lightning_pose.features.base import FeatureExtractor, Record
-from lightning_pose.features.forked_pool import ForkedPool, can_fork
+from lightning_pose.features.forked_pool import ForkedPool, can_fork, use_inner_threads
 from lightning_pose.features.record_files import DamagedError, read_record, write_record
 from lightning_pose.scenes.images import decode_image, read_bytes
 
@@ -125,7 +123,7 @@ class FillJob:
         workers, images = min(self.workers, len(batches)), sum(map(len, batches))
         forks = self.extractor.holds_interpreter and workers > 1 and images >= FORKED and can_fork()
         fork = ForkedPool(replace(self, visit=None)._extract_batch, workers) if forks else None
-        with fork or ThreadPoolExecutor(workers) as pool, _set_inner_threads(max(1, self.workers // workers)):
+        with fork or ThreadPoolExecutor(workers) as pool, use_inner_threads(max(1, self.workers // workers)):
             try:
                 # Processes start here, before the bar's thread runs, which may hold the terminal.
                 yield _start_forked(fork, batches) if fork else [pool.submit(self._extract_batch, b) for b in batches]
@@ -216,19 +214,6 @@ def _start_forked(pool: ForkedPool[list[str], Extracted], batches: list[list[str
         raise CacheError(
             f"cannot start processes to extract features ({error.strerror}); set data.workers to 1"
         ) from error
-
-
-@contextmanager
-def _set_inner_threads(count: int) -> Iterator[None]:
-    """Set the number of threads that torch and OpenCV start inside each thread of ours, and restore it afterwards."""
-    before = torch.get_num_threads(), cv2.getNumThreads()
-    torch.set_num_threads(count)
-    cv2.setNumThreads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before[0])
-        cv2.setNumThreads(before[1])
 
 
 class _RateColumn(ProgressColumn):

@@ -10,8 +10,9 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
+from contextlib import contextmanager
 from typing import Any, Generic, TypeVar
 
 import cv2
@@ -19,7 +20,7 @@ import torch
 
 from lightning_pose.signals import delay_interrupts
 
-__all__ = ["ForkedPool", "can_fork"]
+__all__ = ["ForkedPool", "can_fork", "use_inner_threads"]
 
 A = TypeVar("A")
 R = TypeVar("R")
@@ -54,8 +55,8 @@ class ForkedPool(ProcessPoolExecutor, Generic[A, R]):
         """
         others = multiprocessing.active_children()
         # A process is forked by calls that ignore exceptions, and so Ctrl-C.
-        with delay_interrupts(), warnings.catch_warnings():
-            # Python warns that threads of this process are not in the forked ones: see `_prepare_worker`.
+        with delay_interrupts(), warnings.catch_warnings(), use_inner_threads(1):
+            # Python warns that this process's threads are not in forked ones, where some would be waited for.
             warnings.filterwarnings("ignore", ".*fork.*", DeprecationWarning)
             try:
                 return [self.submit(_call_work, argument) for argument in arguments]
@@ -66,15 +67,26 @@ class ForkedPool(ProcessPoolExecutor, Generic[A, R]):
                 raise
 
 
+@contextmanager
+def use_inner_threads(count: int) -> Iterator[None]:
+    """Set the number of threads that torch and OpenCV start inside each thread of ours, and restore it afterwards."""
+    before = torch.get_num_threads(), cv2.getNumThreads()
+    torch.set_num_threads(count)
+    cv2.setNumThreads(count)  # which ends those that wait
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before[0])
+        cv2.setNumThreads(before[1])
+
+
 def _prepare_worker(work: Callable[[Any], Any], parent: int) -> None:
-    """Leave alone what this process has from its parent: threads, which it has not, open files, and signals."""
+    """Leave alone what this process has from its parent: open files, and signals."""
     global _work  # passed on here, it is not pickled
     _work = work
     for sent in (signal.SIGINT, signal.SIGHUP):  # a terminal sends them to both
         signal.signal(sent, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
     gc.freeze()
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
 

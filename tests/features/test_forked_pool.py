@@ -11,11 +11,13 @@ import time
 from concurrent.futures import BrokenExecutor
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 import torch
 
 from lightning_pose.errors import ImageError
-from lightning_pose.features.forked_pool import ForkedPool, can_fork
+from lightning_pose.features.forked_pool import ForkedPool, can_fork, use_inner_threads
 
 pytestmark = pytest.mark.skipif(not can_fork(), reason="processes cannot be forked here")
 
@@ -31,15 +33,17 @@ def test_it_works_in_other_processes_with_one_thread_each() -> None:
 
 def test_threads_of_the_parent_are_not_waited_for() -> None:
     """A forked process has none of them; work that torch shares out would wait for them without end."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    try:
-        matrix = torch.ones(600, 600)
-        expected = float((matrix @ matrix).sum())  # starts the threads
-        with ForkedPool(lambda number: float((matrix @ matrix).sum()), 2) as pool:
-            assert [started.result(timeout=60) for started in pool.start(range(3))] == [expected] * 3
-    finally:
-        torch.set_num_threads(before)
+    matrix, image = torch.ones(600, 600), np.ones((600, 600), np.uint8)
+
+    def work(number: int) -> float:
+        resized = cv2.GaussianBlur(cv2.resize(image, (1000, 1000)), (31, 31), number + 1)
+        return float((matrix @ matrix).sum()) + float(resized.sum())
+
+    with use_inner_threads(2):
+        expected = [work(number) for number in range(3)]  # starts the threads
+        with ForkedPool(work, 2) as pool:
+            assert [started.result(timeout=60) for started in pool.start(range(3))] == expected
+            assert (torch.get_num_threads(), cv2.getNumThreads()) == (2, 2)
 
 
 def test_an_error_is_raised_as_it_is() -> None:

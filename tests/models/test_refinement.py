@@ -77,8 +77,8 @@ def test_the_regressor_is_trained_as_without(
 ) -> None:
     alone, _, _ = fit(tmp_path)
     state = refined[0].state_dict()
-    for name, value in alone.state_dict().items():
-        assert torch.equal(state[name], value), name
+    for name, value in alone.state_dict().items():  # frames come in another order, and sums are rounded
+        torch.testing.assert_close(state[name], value, rtol=1e-6, atol=1e-6, msg=name)
     assert alone.refinement is None
 
 
