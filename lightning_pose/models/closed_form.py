@@ -103,8 +103,10 @@ class ClosedFormModule(PoseModule):
         return torch.optim.SGD(self.parameters())
 
     def on_train_epoch_start(self) -> None:
-        # Principal components of single precision could not be corrected.
-        precision = self.network.products_in if self.components is None else torch.float64
+        # Single precision is corrected by reading all frames again, which principal components could not be.
+        limit = self.trainer.limit_train_batches  # a share of the batches, or a whole number of them
+        corrected = self.components is None and isinstance(limit, float) and limit == 1
+        precision = self.network.products_in if corrected else torch.float64
         self.moments = Moments(self.network.n_lifted, 7, precision)
 
     def training_step(self, batch: PoseBatch, batch_idx: int) -> None:

@@ -25,6 +25,9 @@ from tests.models.helpers import LearnableProblem, random_poses
 
 D = 16
 
+SETTINGS = {"world_size": 2, "limit_train_batches": 1.0}
+"""Of a trainer with two processes."""
+
 
 class NoisyProblem(LearnableProblem):
     """Features that give the pose with noise; validation and test frames are others than those of training."""
@@ -49,10 +52,13 @@ class NoisyProblem(LearnableProblem):
         return {"class_path": "noise"}
 
 
-def fit(problem: NoisyProblem, folder: Path | None = None, epochs: int = 1, **settings: Any) -> LinearPoseNet:
+def fit(
+    problem: NoisyProblem, folder: Path | None = None, epochs: int = 1, limit: float = 1.0, **settings: Any
+) -> LinearPoseNet:
     model = LinearPoseNet(input_shape=[D], **settings)
     trainer = Trainer(
         max_epochs=epochs,
+        limit_train_batches=limit,
         accelerator="cpu",
         logger=False,
         callbacks=[BestCheckpoint(), LastCheckpoint()] if folder else [],
@@ -88,6 +94,15 @@ def test_it_is_scikit_learns_ridge(standardize: bool, components: int | None) ->
     theirs = Ridge(3.0) if components is None else make_pipeline(PCA(5, svd_solver="full"), Ridge(3.0))
     theirs.fit(*arrays(model, problem.data.data))
     check_predicts(model, theirs, problem.data.data.features)
+
+
+@pytest.mark.parametrize("limit", [0.5, 1], ids=["half of them", "one batch"])
+def test_a_limit_on_batches_limits_what_it_learns_from(limit: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = NoisyProblem(val=0)
+    half = PoseDataset(PoseBatch(*(tensor[:20] for tensor in problem.data.data)))
+    monkeypatch.setattr(problem, "train_dataloader", lambda: make_loader(problem.data, batch_size=20, shuffle=False))
+    model = fit(problem, limit=limit, lambdas=[3.0], standardize=False)
+    check_predicts(model, Ridge(3.0).fit(*arrays(model, half.data)), problem.data.data.features)
 
 
 def test_refit_learns_from_the_validation_frames_too() -> None:
@@ -169,7 +184,7 @@ def test_a_frame_that_a_sampler_repeats_counts_once(monkeypatch: pytest.MonkeyPa
     data = NoisyProblem(count=7, val=0).data.data
     for rank, own in ((0, 4), (1, 3)):  # two processes take 4 frames each of 7; the second's last is a repetition
         model = LinearPoseNet(input_shape=[D])
-        monkeypatch.setattr(LinearPoseNet, "trainer", type("Two", (), {"world_size": 2, "global_rank": rank})())
+        monkeypatch.setattr(LinearPoseNet, "trainer", type("Two", (), SETTINGS | {"global_rank": rank})())
         model.on_train_epoch_start()
         for rows in (slice(0, 3), slice(3, 4)):
             model.add_frames(PoseBatch(*(tensor[rows] for tensor in data)), frames=7)

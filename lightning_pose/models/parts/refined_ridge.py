@@ -51,7 +51,7 @@ def solve_ridges(moments: Moments, lambdas: Sequence[float], batches: Batches) -
 def _refine(moments: Moments, lambdas: Sequence[float], batches: Batches) -> list[Ridge] | None:
     """The solution for each lambda; None if single precision does not lead to it."""
     try:
-        equations = moments.pose_equations(lambdas)
+        equations = moments.make_equations(lambdas)
     except torch.linalg.LinAlgError:  # pyright: ignore[reportPrivateImportUsage]
         return None
     answers = torch.stack([each.solve(each.sides).double() for each in equations])  # (L, D or N, T)

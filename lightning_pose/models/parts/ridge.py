@@ -148,7 +148,7 @@ class Moments:
             LinAlgError: a lambda is too small for the precision.
         """
         if components is None:
-            equations = self.pose_equations(lambdas)
+            equations = self.make_equations(lambdas)
             return [self.make_ridge(each.to_weight(each.solve(each.sides))) for each in equations]
         spectrum, answers = self.spectrum().first(components), []
         projected = spectrum.vectors.T @ self._find_cross()
@@ -157,7 +157,7 @@ class Moments:
             answers.append(self.make_ridge(coefficients @ spectrum.vectors.T, coefficients))
         return answers
 
-    def pose_equations(self, lambdas: Sequence[float]) -> list[Equations]:
+    def make_equations(self, lambdas: Sequence[float]) -> list[Equations]:
         """For each lambda the system of equations whose answer are the weights, factorised.
 
         Raises:
