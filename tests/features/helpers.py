@@ -11,7 +11,7 @@ import numpy as np
 
 from lightning_pose.features.base import FeatureExtractor, Record
 
-__all__ = ["ColorMeans", "write_images"]
+__all__ = ["ColorMeans", "expected", "records_in", "write_images"]
 
 
 class ColorMeans(FeatureExtractor):
@@ -45,3 +45,14 @@ def write_images(folder: Path, count: int) -> list[Path]:
     for n, path in enumerate(paths):
         cv2.imwrite(str(path), np.full((5, 6, 3), (100, 2 * n, n), np.uint8))
     return paths
+
+
+def expected(count: int) -> np.ndarray:
+    """Features (count, 3) of the images of `write_images`."""
+    n = np.arange(count, dtype=np.float32)
+    return np.stack([n, 2 * n, np.full(count, 100, np.float32)], axis=1)
+
+
+def records_in(root: Path) -> list[Path]:
+    """Files of a cache's records."""
+    return sorted(root.rglob("*.safetensors"))
