@@ -12,8 +12,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
 
+from lightning_pose.concurrency.signals import STOPPING, interrupt_on
 from lightning_pose.errors import PoseError
-from lightning_pose.signals import STOPPING, interrupt_on
 
 __all__ = ["main"]
 

@@ -19,6 +19,7 @@ from lightning.pytorch.utilities.exceptions import SIGTERMException
 from lightning_pose.checkpoint import check_specs, find_class_paths, read_checkpoint
 from lightning_pose.commands.config_parser import ALLOW_HELP, PoseParser, parser_settings, rename_value
 from lightning_pose.commands.setting_errors import REMEDY, explain_setting_error
+from lightning_pose.concurrency.tasks import SCHEDULER_HELP
 from lightning_pose.data import SceneDataModule, require_clips
 from lightning_pose.errors import ConfigError
 from lightning_pose.evaluation.callback import TestReport
@@ -37,7 +38,6 @@ from lightning_pose.runs.lightning_messages import filter_messages
 from lightning_pose.runs.recorder import RunRecorder
 from lightning_pose.runs.resume import check_architecture, check_resumable, check_same_settings, is_complete, read_seed
 from lightning_pose.scenes.trajectory_files import write_sequences
-from lightning_pose.tasks import SCHEDULER_HELP
 
 __all__ = ["PoseCLI", "main"]
 

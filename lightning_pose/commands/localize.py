@@ -15,10 +15,10 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from lightning_pose.commands.parser import VerbParser
+from lightning_pose.concurrency.tasks import SCHEDULER_HELP
 from lightning_pose.errors import ConfigError, ImageError
 from lightning_pose.localization.pose_lines import LineFormat, PoseWriter, find_line_format
 from lightning_pose.localization.sources import ImageFiles, VideoSource, find_sources
-from lightning_pose.tasks import SCHEDULER_HELP
 
 if TYPE_CHECKING:
     from argparse import Namespace

@@ -15,8 +15,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from lightning_pose.commands.parser import VerbParser
+from lightning_pose.concurrency.tasks import SCHEDULER_HELP
 from lightning_pose.errors import ConfigError
-from lightning_pose.tasks import SCHEDULER_HELP
 
 if TYPE_CHECKING:  # Optuna and Lightning take seconds, and `--help` does without
     from mlflow import MlflowClient
@@ -87,7 +87,7 @@ def main(argv: list[str]) -> int:
     own, overrides = _split_arguments(argv)
     args = _build_sweep_parser().parse_args(own)
     # Imported here, so that `--help` does not wait for them.
-    from lightning_pose.signals import delay_interrupts
+    from lightning_pose.concurrency.signals import delay_interrupts
     from lightning_pose.studies.figure_spec import parse_figure_spec
     from lightning_pose.sweeps.parent_run import close_parent, open_parent
     from lightning_pose.sweeps.plan import read_plan

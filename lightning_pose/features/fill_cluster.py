@@ -6,10 +6,10 @@ import time
 from collections.abc import Sequence
 from functools import partial
 
+from lightning_pose.concurrency.tasks import run_tasks
 from lightning_pose.errors import ImageError
 from lightning_pose.features.cache import FeatureCache, FillReport
 from lightning_pose.features.fill_job import ImagePath, make_extraction_bar
-from lightning_pose.tasks import run_tasks
 
 __all__ = ["fill_on_cluster"]
 

@@ -6,11 +6,11 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 
+from lightning_pose.concurrency.tasks import run_tasks
 from lightning_pose.errors import ConfigError, ImageError
 from lightning_pose.geometry.camera import Camera
 from lightning_pose.localization.localizer import Localizer
 from lightning_pose.localization.located_pose import LocatedPose, refuse_image
-from lightning_pose.tasks import run_tasks
 
 __all__ = ["ModelSource", "locate_file", "locate_files"]
 

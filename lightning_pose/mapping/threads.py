@@ -23,7 +23,7 @@ def map_in_threads(work: Callable[[Item], Result], items: Iterable[Item]) -> lis
     """
     import torch  # a second; whoever only asks a map does without
 
-    from lightning_pose.threads import use_one_thread
+    from lightning_pose.concurrency.threads import use_one_thread
 
     items = list(items)
     with use_one_thread() as threads:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from lightning.fabric.utilities.rank_zero import rank_zero_only
 from lightning.pytorch.loggers import MLFlowLogger
 
+from lightning_pose.concurrency.signals import delay_interrupts
 from lightning_pose.errors import ConfigError
 from lightning_pose.paths import STORE_VARIABLE, default_tracking_uri
 from lightning_pose.runs.client import BufferedClient, is_unreachable, wait_while_locked
@@ -19,7 +20,6 @@ from lightning_pose.runs.process import has_owner_died, process_tags
 from lightning_pose.runs.reader import mask_passwords
 from lightning_pose.runs.store import prepare_store, sqlite_file
 from lightning_pose.runs.tags import PARENT_TAG
-from lightning_pose.signals import delay_interrupts
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient

@@ -19,6 +19,7 @@ from optuna import Trial
 from optuna.exceptions import OptunaError
 
 from lightning_pose.cli import PoseCLI
+from lightning_pose.concurrency.signals import delay_interrupts
 from lightning_pose.errors import ConfigError, PoseError
 from lightning_pose.evaluation.callback import TestReport
 from lightning_pose.evaluation.costs import costs
@@ -27,7 +28,6 @@ from lightning_pose.models.parts.symmetric import shared_factors
 from lightning_pose.runs.checkpoints import BestCheckpoint, checkpoint_folder, run_logger
 from lightning_pose.runs.process import process_tags
 from lightning_pose.runs.tags import CURVES, METRICS, PARENT_TAG, REASON, RUN
-from lightning_pose.signals import delay_interrupts
 from lightning_pose.sweeps.base_config import ParsedConfig, open_keypoint_data
 from lightning_pose.sweeps.plan import Plan
 from lightning_pose.sweeps.space import Settings, draw_values

@@ -30,14 +30,14 @@ from optuna.exceptions import UpdateFinishedTrialError
 from optuna.storages import RDBStorage, fail_stale_trials
 from optuna.trial import TrialState
 
+from lightning_pose.concurrency.signals import STOPPING, interrupt_on
+from lightning_pose.concurrency.tasks import run_tasks
 from lightning_pose.runs.process import process_name
 from lightning_pose.runs.tags import PROCESS
-from lightning_pose.signals import STOPPING, interrupt_on
 from lightning_pose.sweeps.plan import Plan
 from lightning_pose.sweeps.storage import lock_study
 from lightning_pose.sweeps.study import count_waiting, is_grid, load_study, open_storage, queue_again, recover_trials
 from lightning_pose.sweeps.trial import run_trial
-from lightning_pose.tasks import run_tasks
 
 __all__ = ["Job", "run_here", "run_in_processes", "run_next_trial", "run_on_cluster"]
 

@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lightning_pose.concurrency.forked_pool import can_fork
 from lightning_pose.errors import CacheError, ImageError
 from lightning_pose.features import fill_job
 from lightning_pose.features.base import Record
 from lightning_pose.features.cache import FeatureCache
-from lightning_pose.features.forked_pool import can_fork
 from tests.features.helpers import ColorMeans, expected, records_in, write_images
 
 

@@ -15,12 +15,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lightning_pose.concurrency.threads import use_one_thread
 from lightning_pose.errors import ConfigError, ImageError
 from lightning_pose.features.base import LocalExtractor, Record
 from lightning_pose.features.surf.descriptor import UPRIGHT_ANGLE, compute_descriptors, compute_orientations
 from lightning_pose.features.surf.detector import detect_keypoints
 from lightning_pose.features.surf.hessian import compute_integral_image
-from lightning_pose.threads import use_one_thread
 
 __all__ = ["SURF", "SurfFeatures"]
 

@@ -18,7 +18,7 @@ from typing import Any, Generic, TypeVar
 import cv2
 import torch
 
-from lightning_pose.signals import delay_interrupts
+from lightning_pose.concurrency.signals import delay_interrupts
 
 __all__ = ["ForkedPool", "can_fork", "use_inner_threads"]
 

@@ -14,11 +14,11 @@ import pytest
 import yaml
 
 from lightning_pose import tasks
+from lightning_pose.concurrency.tasks import run_tasks
 from lightning_pose.errors import ConfigError
 from lightning_pose.features import FeatureCache
 from lightning_pose.features.base import Record
 from lightning_pose.features.fill_cluster import fill_on_cluster
-from lightning_pose.tasks import run_tasks
 from tests.cluster import Cluster, start_cluster
 from tests.helpers import Thumbnails, Workplace
 

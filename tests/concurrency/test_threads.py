@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import lightning_pose
-from lightning_pose.threads import use_one_thread
+from lightning_pose.concurrency.threads import use_one_thread
 
 
 def test_small_work_takes_one_thread_and_others_have_theirs_again() -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from lightning_pose import __main__
 from lightning_pose.__main__ import main
-from lightning_pose.signals import STOPPING, delay_interrupts, interrupt_on
+from lightning_pose.concurrency.signals import STOPPING, delay_interrupts, interrupt_on
 from tests.helpers import FailAt, Workplace
 
 
@@ -74,7 +74,7 @@ def test_signals_wait_for_the_end_of_a_write() -> None:
 
 
 def test_a_closed_terminal_closes_the_run(workplace: Workplace, capsys: pytest.CaptureFixture[str]) -> None:
-    stopper = ["--trainer.callbacks+", "tests.test_signals.HangUpAt", "--trainer.callbacks.epoch", "1"]
+    stopper = ["--trainer.callbacks+", "tests.concurrency.test_signals.HangUpAt", "--trainer.callbacks.epoch", "1"]
     assert workplace.run("fit", "--trainer.max_epochs", "1000", *stopper) == 128 + signal.SIGHUP
     (run,) = workplace.runs()
     assert run.info.status == "KILLED"

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 import torch
 
+from lightning_pose.concurrency.forked_pool import ForkedPool, can_fork, use_inner_threads
 from lightning_pose.errors import ImageError
-from lightning_pose.features.forked_pool import ForkedPool, can_fork, use_inner_threads
 
 pytestmark = pytest.mark.skipif(not can_fork(), reason="processes cannot be forked here")
 
@@ -74,7 +74,7 @@ def test_what_a_terminal_sends_is_left_to_the_parent(sent: signal.Signals) -> No
 
 def test_processes_of_a_killed_one_end() -> None:
     code = (
-        "import os, time; from lightning_pose.features.forked_pool import ForkedPool\n"
+        "import os, time; from lightning_pose.concurrency.forked_pool import ForkedPool\n"
         "pool = ForkedPool(lambda seconds: time.sleep(seconds) or os.getpid(), 1)\n"
         "print(pool.start([0])[0].result(), flush=True); pool.start([60])[0].result()"
     )
