@@ -10,17 +10,16 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ProcessPoolExecutor
-from contextlib import contextmanager
 from typing import Any, Generic, TypeVar
 
-import cv2
 import torch
 
 from lightning_pose.concurrency.signals import delay_interrupts
+from lightning_pose.concurrency.threads import use_inner_threads
 
-__all__ = ["ForkedPool", "can_fork", "use_inner_threads"]
+__all__ = ["ForkedPool", "can_fork"]
 
 A = TypeVar("A")
 R = TypeVar("R")
@@ -67,19 +66,6 @@ class ForkedPool(ProcessPoolExecutor, Generic[A, R]):
                 raise
 
 
-@contextmanager
-def use_inner_threads(count: int) -> Iterator[None]:
-    """Set the number of threads that torch and OpenCV start inside each thread of ours, and restore it afterwards."""
-    before = torch.get_num_threads(), cv2.getNumThreads()
-    torch.set_num_threads(count)
-    cv2.setNumThreads(count)  # which ends those that wait
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before[0])
-        cv2.setNumThreads(before[1])
-
-
 def _prepare_worker(work: Callable[[Any], Any], parent: int) -> None:
     """Leave alone what this process has from its parent: open files, and signals."""
     global _work  # passed on here, it is not pickled
@@ -92,7 +78,7 @@ def _prepare_worker(work: Callable[[Any], Any], parent: int) -> None:
 
 
 def _end_with(parent: int) -> None:
-    """End this process when its parent has been killed, which has not told it to."""
+    """End this process once its parent has ended: a parent that is killed cannot stop its pool."""
     while os.getppid() == parent:
         time.sleep(0.5)
     os._exit(1)

@@ -1,13 +1,14 @@
-"""How many threads torch uses for work that is too small to be shared out."""
+"""How many threads torch and OpenCV use inside threads of ours, or for work that is too small to be shared out."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+import cv2
 import torch
 
-__all__ = ["use_one_thread"]
+__all__ = ["use_inner_threads", "use_one_thread"]
 
 
 @contextmanager
@@ -25,3 +26,16 @@ def use_one_thread() -> Iterator[int]:
     finally:
         if threads > 1:
             torch.set_num_threads(threads)
+
+
+@contextmanager
+def use_inner_threads(count: int) -> Iterator[None]:
+    """Set the number of threads that torch and OpenCV start inside each thread of ours, and restore it afterwards."""
+    before = torch.get_num_threads(), cv2.getNumThreads()
+    torch.set_num_threads(count)
+    cv2.setNumThreads(count)  # which ends those that wait
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before[0])
+        cv2.setNumThreads(before[1])

@@ -18,7 +18,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
-from lightning_pose.concurrency.forked_pool import ForkedPool, can_fork, use_inner_threads
+from lightning_pose.concurrency.forked_pool import ForkedPool, can_fork
+from lightning_pose.concurrency.threads import use_inner_threads
 from lightning_pose.errors import CacheError, ImageError
 from lightning_pose.features.base import FeatureExtractor, Record
 from lightning_pose.features.record_files import DamagedError, read_record, write_record

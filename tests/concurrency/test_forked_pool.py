@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 import torch
 
-from lightning_pose.concurrency.forked_pool import ForkedPool, can_fork, use_inner_threads
+from lightning_pose.concurrency.forked_pool import ForkedPool, can_fork
+from lightning_pose.concurrency.threads import use_inner_threads
 from lightning_pose.errors import ImageError
 
 pytestmark = pytest.mark.skipif(not can_fork(), reason="processes cannot be forked here")

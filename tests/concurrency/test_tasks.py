@@ -13,7 +13,7 @@ import optuna
 import pytest
 import yaml
 
-from lightning_pose import tasks
+from lightning_pose.concurrency import tasks
 from lightning_pose.concurrency.tasks import run_tasks
 from lightning_pose.errors import ConfigError
 from lightning_pose.features import FeatureCache

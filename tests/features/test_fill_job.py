@@ -64,7 +64,7 @@ def test_processes_count_and_save_all_but_bad_images(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("forked")
-def test_a_killed_process_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_killed_process_has_a_remedy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     paths = write_images(tmp_path / "images", 30)
     extractor = HeldColorMeans()
     monkeypatch.setattr(extractor, "deadly", True)
@@ -73,7 +73,7 @@ def test_a_killed_process_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.usefixtures("forked")
-def test_processes_that_cannot_start_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_processes_that_cannot_start_have_a_remedy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     paths, fork, started = write_images(tmp_path / "images", 30), os.fork, list[int]()
 
     def fork_once() -> int:
