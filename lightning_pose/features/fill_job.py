@@ -143,7 +143,7 @@ class FillJob:
         self.bad |= extracted.bad
         for key in batch if self.visit is not None and extracted.apart else ():
             if self.numbers[key][0] not in extracted.bad and not self._visit_record(key):
-                self._extract_batch([key])  # something has deleted or damaged it meanwhile
+                self.bad |= self._extract_batch([key]).bad  # something has deleted or damaged it meanwhile
 
     def _compute_key(self, number: int) -> str | None:
         """Digest of an image file's content; None if it cannot be read, which is noted in `bad`."""

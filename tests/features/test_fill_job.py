@@ -89,3 +89,15 @@ def test_processes_that_cannot_start_have_a_remedy(tmp_path: Path, monkeypatch: 
     for child in multiprocessing.active_children():
         child.join(timeout=30)
     assert not multiprocessing.active_children()
+
+
+@pytest.mark.parametrize("readable", [True, False])
+def test_a_record_that_is_gone_is_extracted_here_or_its_image_is_bad(readable: bool, tmp_path: Path) -> None:
+    paths, seen = write_images(tmp_path / "images", 1), list[int]()
+    job = fill_job.FillJob(ColorMeans(), tmp_path, paths, lambda numbers, record: seen.extend(numbers), workers=2)
+    job.read()
+    (key,) = job.missing
+    if not readable:
+        paths[0].write_bytes(b"no image")
+    job._take([key], fill_job.Extracted({key}, {}, apart=True))
+    assert (seen, [*job.bad]) == (([0], []) if readable else ([], [0]))
